@@ -1,3 +1,1 @@
-"""Published protocols and this project's development benchmark: each a command that prints a table and a JSON
-line.
-"""
+"""Experiments: published protocols and development benchmarks, each a command that prints tables and a JSON line."""

@@ -1,18 +1,18 @@
-"""Tables of the pages, made from the files in docs/results.
+"""Update the tables in the pages of docs from the files in docs/results.
 
 ``python -m meshmatch.experiments.pages [--check]``
 
-Every experiment writes such a file with ``--save docs/results/NAME.json``: when, on which commit, machine and data, and by
-which command it ran, and its tables. A page asks for a table between two comments,
+Every experiment writes such a file with ``--save docs/results/NAME.json``. It contains the date, commit, machine, data and
+command of the run, and its tables. A page includes a table between two comments,
 
     <!-- results NAME 1: set, mean, median -->
     <!-- end -->
 
-the number of the table in the file, from 1, and which columns (all of them where none is named). Below its first table of a
-file a page says when and how that was made. A page begins the table of all sets (`SUMMARY`) with ``<!-- summary -->``.
-Whatever stands between the comments is replaced.
+with the number of the table in the file, from 1, and the columns (by default all). The text between the comments is
+replaced. Below a page's first table of a file are the date, commit and machine. The table of all sets (`SUMMARY`) is
+included with ``<!-- summary -->``.
 
-A file that the commands of today cannot make again says in ``last_commit`` which commit was the last that could.
+``last_commit`` in a file is the last commit that can repeat it, if current commands cannot.
 """
 
 from __future__ import annotations
@@ -35,8 +35,11 @@ _COLUMNS = ("mean", "median", "lost", "flips", "pairs")
 
 
 class Row(NamedTuple):
-    """A row of the summary: its name, the file, which row of the file's first table, by the beginnings of cells, the file's
-    columns for `_COLUMNS` (empty where it has none), and the unit."""
+    """A row of the summary.
+
+    ``where`` selects the row of the file's first table by the prefixes of its cells; ``columns`` are the file's columns for
+    `_COLUMNS`, empty where there is none.
+    """
 
     name: str
     file: str
@@ -73,71 +76,73 @@ SUMMARY = (
 
 
 def results_file(name: str, docs: Path = DOCS) -> dict[str, Any]:
-    """A file of docs/results.
+    """Read a file of docs/results.
 
     Raises
     ------
     InputError
-        It is not there, or holds no tables.
+        The file is missing, or has no tables.
     """
     path = docs / "results" / f"{name}.json"
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        found["tables"][0]["columns"]
+        results = json.loads(path.read_text(encoding="utf-8"))
+        results["tables"][0]["columns"]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path} is not a file of results", "an experiment writes it: --save FILE") from error
-    return dict(found)
+    return dict(results)
 
 
 def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of a page."""
+    """A Markdown table."""
     lines = [f"| {' | '.join(each)} |" for each in (columns, *rows)]
     return "\n".join([lines[0], "|---" * len(columns) + "|", *lines[1:], ""])
 
 
-def table_of(words: str, docs: Path, above: bool = False) -> str:
-    """The table that a comment asks for, and when, on which commit and machine it was made, unless that stands ``above``."""
+def build_table(words: str, docs: Path, above: bool = False) -> str:
+    """The table for a comment's ``words``, followed by its date, commit and machine unless the page has them ``above``."""
     head, _, names = words.partition(":")
     name, number = head.split()
-    found = results_file(name, docs)
-    table = found["tables"][int(number) - 1]
+    results = results_file(name, docs)
+    table = results["tables"][int(number) - 1]
     wanted = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
-    places = [table["columns"].index(each) for each in wanted]
-    rows = [[row[place] for place in places] for row in table["rows"]]
-    told = f"[{name}.json](results/{name}.json)"
+    indices = [table["columns"].index(each) for each in wanted]
+    rows = [[row[index] for index in indices] for row in table["rows"]]
+    source = f"[{name}.json](results/{name}.json)"
     if above:
-        told += ", as above"
+        source += ", as above"
     else:
-        told += f": {found['date']}, commit {found['commit']}, {found['machine']}"
-        if last := found.get("last_commit"):
-            told += f"; to repeat it, check out {last}"
-    return f"\n{markdown(wanted, rows)}\n{told}.\n\n"
+        source += f": {results['date']}, commit {results['commit']}, {results['machine']}"
+        if last := results.get("last_commit"):
+            source += f"; to repeat it, check out {last}"
+    return f"\n{markdown(wanted, rows)}\n{source}.\n\n"
 
 
 def summary(docs: Path) -> str:
-    """A row for every set that is measured."""
+    """The summary table, with one row for every evaluated set."""
     rows = []
-    for each in SUMMARY:
-        table = results_file(each.file, docs)["tables"][0]
+    for entry in SUMMARY:
+        table = results_file(entry.file, docs)["tables"][0]
         cells = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
-        row = next(one for one in cells if all(one[key].startswith(value) for key, value in each.where.items()))
-        rows.append([each.name, *(row[column] if column else "" for column in each.columns), each.unit])
+        row = next(
+            cell_row for cell_row in cells if all(cell_row[key].startswith(value) for key, value in entry.where.items())
+        )
+        rows.append([entry.name, *(row[column] if column else "" for column in entry.columns), entry.unit])
     return f"\n{markdown(['set', *_COLUMNS, 'unit'], rows)}\n"
 
 
-def refreshed(text: str, docs: Path) -> str:
-    """A page with its tables as the files have them now."""
+def update_tables(text: str, docs: Path) -> str:
+    """Text of a page with its tables updated from the files."""
     files: set[str] = set()
 
-    def block(match: re.Match[str]) -> str:
+    def replacement(match: re.Match[str]) -> str:
         if match[2] == "summary":
             return f"{match[1]}{summary(docs)}{match[5]}"
         name = match[3].split()[0]
-        made = table_of(match[3].strip(), docs, above=name in files)
+        table = build_table(match[3].strip(), docs, above=name in files)
         files.add(name)
-        return f"{match[1]}{made}{match[5]}"
+        return f"{match[1]}{table}{match[5]}"
 
-    return _BLOCK.sub(block, text)
+    return _BLOCK.sub(replacement, text)
 
 
 @runner.command
@@ -149,7 +154,7 @@ def main(
     for name in PAGES:
         path = docs / name
         before = path.read_text(encoding="utf-8")
-        after = refreshed(before, docs)
+        after = update_tables(before, docs)
         if after != before:
             stale.append(name)
             if not check:

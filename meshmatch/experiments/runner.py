@@ -1,15 +1,15 @@
-"""The runner that all experiments share: options, circumstances, finished work kept in a folder, tables, one JSON line.
+"""Common infrastructure of all experiments: options, run metadata, caching of finished results, tables, one JSON line.
 
-An experiment is a function with typer annotations that returns a `Report`; `command` makes its `main`. Shared options
-(`Data`, `Seed`, `Threads`, ...) are declared here once. Rows of a table are the dictionaries of the record:
+An experiment is a function with typer annotations that returns a `Report`; `command` turns it into the module's `main`.
+Shared options (`Data`, `Seed`, `Threads`, ...) are declared here. Rows of a table are the dictionaries of the record:
 
-    @command  # last in its module: where that is run as a program, it runs here
+    @command  # last in the module: if that is run as a program, it runs here
     def main(data: Data = DATA, seed: Seed = 0) -> Report:
         rows = [{"set": "scape", "mean_cm": 1.63}]
         return Report({"sets": rows}, [table("Errors", rows, {"set": "set", "mean": "mean_cm:.2f"})])
 
-Every experiment takes ``--save FILE``, which writes a file of results (`saved_record`): by which command, when, on which
-commit, machine and data it ran, its tables as they are printed, and its values. The pages are made from such files
+Every experiment has the option ``--save FILE``, which writes a file of results (`saved_record`): command, date, commit,
+machine, data, the tables as printed, and their values. The pages of docs are made from such files
 (`meshmatch.experiments.pages`).
 """
 
@@ -51,15 +51,15 @@ Seed = Annotated[int, typer.Option(min=0)]
 Threads = Annotated[int, typer.Option(min=1, help="threads of each process")]
 Jobs = Annotated[int, typer.Option(min=1, help="processes")]
 LimitPairs = Annotated[int | None, typer.Option(min=1, help="pairs of each set, evenly spread")]
-Work = Annotated[Path | None, typer.Option(help="keep what is finished in this folder, and go on with what is there")]
-Cache = Annotated[Path | None, typer.Option(help="folder of kept geodesic distances (10 GB for all sets)")]
+Work = Annotated[Path | None, typer.Option(help="keep finished results in this folder, and reuse those that are there")]
+Cache = Annotated[Path | None, typer.Option(help="folder for the cache of geodesic distances (10 GB for all sets)")]
 
 
 @dataclass(frozen=True)
 class Report:
-    """What an experiment found: the record for the JSON line, tables, and lines to print below them.
+    """Result of an experiment: the record for the JSON line, tables, and lines to print below them.
 
-    ``stopped`` is told last, on stderr, and makes the status 1.
+    ``stopped`` is an error to report last, on stderr; the exit status is then 1.
     """
 
     record: Mapping[str, Any]
@@ -72,36 +72,36 @@ Save = Annotated[Path | None, typer.Option(help="write tables, values and circum
 
 
 def command(run: Callable[..., Report]) -> Callable[..., int]:
-    """The ``main`` of an experiment: parse words, run, print, and return the exit status. Called at once in a module that is
-    run as a program.
+    """Decorate an experiment to become the module's ``main``: parse arguments, run, print, and return the exit status.
 
-    0: it ran; 1: the data or a choice stopped it (one line on stderr); 2: usage. The module's docstring is its help. The
-    JSON line begins with the circumstances and the options; with ``--save`` it is written to a file too, with the tables.
+    If the module is run as a program, this runs it at once. The exit status is 0 for success, 1 if the data or an option is
+    invalid (one line on stderr), 2 for wrong usage. The module's docstring is the command's help. The JSON line begins with
+    metadata and options; ``--save`` also writes it to a file, with the tables.
     """
     module = sys.modules[run.__module__]
-    spec = module.__spec__  # a module that is run is called __main__
+    spec = module.__spec__  # has the real name of a module that is run as __main__
     name = str(spec.name if spec else run.__module__).removeprefix("meshmatch.experiments.").removesuffix(".__main__")
     program = f"python -m meshmatch.experiments.{name}"
 
-    def body(words: Sequence[str], save: Path | None, options: dict[str, Any]) -> None:
+    def run_and_print(words: Sequence[str], save: Path | None, options: dict[str, Any]) -> None:
         threads, jobs = options.get("threads", 1), options.get("jobs", 1)
         set_threads(threads)
-        began = time.perf_counter()
+        start = time.perf_counter()
         try:
             report = run(**options)
         except MeshmatchError as error:
             explain(error)
             raise SystemExit(1) from None
-        out = Console(width=None if os.isatty(1) else 140, highlight=False)  # a pipe has no width of its own
+        out = Console(width=None if os.isatty(1) else 140, highlight=False)  # a pipe has no width
         for each in report.tables:
             out.print(each)
         for line in report.notes:
             out.print(line, soft_wrap=True, markup=False)
-        head = {"experiment": name, **circumstances(threads, jobs), "options": plain(options)}
-        head["seconds"] = round(time.perf_counter() - began, 1)
-        print(json.dumps(plain({**head, **report.record})), flush=True)
+        metadata = {"experiment": name, **circumstances(threads, jobs), "options": plain(options)}
+        metadata["seconds"] = round(time.perf_counter() - start, 1)
+        print(json.dumps(plain({**metadata, **report.record})), flush=True)
         if save is not None:
-            record = saved_record(head, [f"{program} {shlex.join(words)}".strip()], report)
+            record = saved_record(metadata, [f"{program} {shlex.join(words)}".strip()], report)
             with replace_on_success(save) as temporary:
                 temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         if report.stopped is not None:
@@ -109,20 +109,20 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
             raise SystemExit(1)
 
     def main(words: Sequence[str] | None = None) -> int:
-        given = sys.argv[1:] if words is None else list(words)
+        arguments = sys.argv[1:] if words is None else list(words)
 
         @functools.wraps(run)
         def called(save: Path | None = None, **options: Any) -> None:
-            body(_without_save(given), save, options)
+            run_and_print(_without_save(arguments), save, options)
 
-        known = inspect.signature(run, eval_str=True)
-        last = inspect.Parameter("save", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Save)
-        called.__signature__ = known.replace(parameters=[*known.parameters.values(), last])  # type: ignore[attr-defined]
+        signature = inspect.signature(run, eval_str=True)
+        save_parameter = inspect.Parameter("save", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Save)
+        called.__signature__ = signature.replace(parameters=[*signature.parameters.values(), save_parameter])  # type: ignore[attr-defined]
         called.__annotations__ = {**run.__annotations__, "save": Save}
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
         app.command(help=module.__doc__)(called)
         try:
-            typer.main.get_command(app)(args=given, prog_name=program)
+            typer.main.get_command(app)(args=arguments, prog_name=program)
         except SystemExit as stop:
             return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         return 0
@@ -133,24 +133,24 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
 
 
 def _without_save(words: Sequence[str]) -> list[str]:
-    """Words of a command line without the option that writes the file they stand in."""
+    """Arguments of a command line without ``--save``."""
     kept = [word for word in words if not word.startswith("--save=")]
     if "--save" in kept:
-        at = kept.index("--save")
-        del kept[at : at + 2]
+        index = kept.index("--save")
+        del kept[index : index + 2]
     return kept
 
 
-def saved_record(head: Mapping[str, Any], commands: Sequence[str], report: Report) -> dict[str, Any]:
-    """A file of results: ``commands``, circumstances, ``data``, ``tables`` of words and ``values`` of numbers."""
-    data = head["options"].get("data", "generated")
+def saved_record(metadata: Mapping[str, Any], commands: Sequence[str], report: Report) -> dict[str, Any]:
+    """Contents of a file of results: metadata, ``commands``, ``data``, ``tables`` as text and ``values`` as numbers."""
+    data = metadata["options"].get("data", "generated")
     tables = [{"title": str(each.title), **dict(zip(("columns", "rows"), words_of(each), strict=True))}
               for each in report.tables]  # fmt: skip
-    return {**head, "commands": list(commands), "data": data, "tables": tables, "values": plain(report.record)}
+    return {**metadata, "commands": list(commands), "data": data, "tables": tables, "values": plain(report.record)}
 
 
 def explain(error: MeshmatchError) -> None:
-    """Print on stderr what stopped an experiment."""
+    """Print an error and its hint on stderr."""
     console = Console(stderr=True, highlight=False)
     console.print(f"[red]error:[/] {escape(error.message)}", soft_wrap=True)
     if error.hint:
@@ -158,18 +158,18 @@ def explain(error: MeshmatchError) -> None:
 
 
 def tell(line: str) -> None:
-    """Print on stderr what is going on."""
+    """Print a line about the progress on stderr."""
     Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)
 
 
 def track(items: Iterable[T], what: str, total: int | None = None) -> Iterable[T]:
-    """The same items, with a progress bar on stderr."""
+    """Iterate over items with a progress bar on stderr."""
     console = Console(stderr=True)
     return progress.track(items, what, total=total, console=console, disable=not console.is_terminal)
 
 
 def plain(value: Any) -> Any:
-    """What JSON can say: paths as words, tuples as lists, numbers that are not finite as null."""
+    """Convert a value for JSON: tuples and arrays to lists, numbers that are not finite to null, paths to strings."""
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -182,18 +182,18 @@ def plain(value: Any) -> Any:
 
 
 def installed(methods: Sequence[str], packages: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The methods but those named as a package that is not here, and a line for each of these."""
+    """Methods without those that are named like a package that is not installed, and a message for each of these."""
     missing = [name for name in methods if name in packages and find_spec(name) is None]
     return [name for name in methods if name not in missing], [f"skipped: {name} is not installed" for name in missing]
 
 
 def names_of(words: str, known: Iterable[str], what: str) -> list[str]:
-    """Names separated by commas, each once and in the order given.
+    """Split names separated by commas, without duplicates; ``what`` they are, for messages.
 
     Raises
     ------
     OptionError
-        A name that is not known.
+        A name is unknown.
     """
     allowed = list(known)
     names = list(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
@@ -204,36 +204,38 @@ def names_of(words: str, known: Iterable[str], what: str) -> list[str]:
 
 
 def files_in(folder: Path, pattern: str, least: int = 1) -> list[Path]:
-    """The files of a folder of data, sorted; `InputError` where there are fewer than this."""
+    """Sorted files of a data folder that match a pattern; `InputError` if there are fewer than ``least``."""
     files = sorted(folder.glob(pattern))
     if len(files) < least:
-        few = f"there are {len(files) or 'no'} {pattern} files in {folder}"
-        raise InputError(few if least == 1 else f"{few}, not {least} or more", "name the data's folder with --data")
+        problem = f"there are {len(files) or 'no'} {pattern} files in {folder}"
+        raise InputError(
+            problem if least == 1 else f"{problem}, not {least} or more", "name the data's folder with --data"
+        )
     return files
 
 
 def spread(items: Sequence[T], count: int | None) -> list[T]:
-    """``count`` items, evenly spread over a sequence and always the same ones; all of them for None or a large count."""
+    """Select ``count`` items at even distances in a sequence; all items if ``count`` is None or not smaller."""
     if count is None or count >= len(items):
         return list(items)
     return [items[k] for k in np.linspace(0, len(items) - 1, max(1, count)).round().astype(int)]
 
 
 def table(title: str, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
-    """Rows as a table.
+    """Build a table from rows.
 
     Parameters
     ----------
     columns
-        Heading: key of the row, or "key:format" for numbers, which stand to the right (format ">" for words that do).
-        What a row lacks, None and nan leave the cell empty.
+        For each heading the key in the rows, or "key:format" for numbers, which are aligned to the right (format ">" aligns
+        text to the right). Missing values, None and nan give an empty cell.
     """
-    drawn = Table(title=title, title_justify="left")
+    result = Table(title=title, title_justify="left")
     for heading, column in columns.items():
-        drawn.add_column(heading, justify="right" if ":" in column else "left", no_wrap=":" not in column)
+        result.add_column(heading, justify="right" if ":" in column else "left", no_wrap=":" not in column)
     for row in rows:
-        drawn.add_row(*(_cell(row, *column.partition(":")[::2]) for column in columns.values()))
-    return drawn
+        result.add_row(*(_cell(row, *column.partition(":")[::2]) for column in columns.values()))
+    return result
 
 
 def _cell(row: Mapping[str, Any], key: str, form: str) -> str:
@@ -243,14 +245,14 @@ def _cell(row: Mapping[str, Any], key: str, form: str) -> str:
     return format(value, form).replace("%", " %") if form != ">" else str(value)
 
 
-def words_of(drawn: Table) -> tuple[list[str], list[list[str]]]:
-    """A table's columns and rows, as words."""
-    rows = zip(*(map(str, column.cells) for column in drawn.columns), strict=True)
-    return [str(column.header) for column in drawn.columns], [list(row) for row in rows]
+def words_of(table: Table) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of a table as strings."""
+    rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
+    return [str(column.header) for column in table.columns], [list(row) for row in rows]
 
 
 def circumstances(threads: int, jobs: int = 1) -> dict[str, Any]:
-    """Date, commit, machine and threads, as every published number needs them."""
+    """Metadata of a run, as published with every number: date, commit, machine, Python, threads and jobs."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "commit": commit(),
@@ -285,14 +287,14 @@ def _processor() -> str:
 
 
 def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
-    """A kept result; None where there is no file.
+    """Read a cached result; None if there is no file.
 
     Raises
     ------
     InputError
         The file is damaged.
     OptionError
-        It was measured with other choices than ``asked``.
+        The result is for other options than ``asked``.
     """
     if not path.is_file():
         return None
@@ -304,30 +306,30 @@ def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def as_asked(found: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A kept result, which must be one; ``where`` it was kept, in words.
+    """Check a cached result; ``where`` names its origin in messages.
 
     Raises
     ------
     InputError
-        It is no result.
+        It is not a result.
     OptionError
-        It was measured with other choices than ``asked``.
+        The result is for other options than ``asked``.
     """
     try:
-        before = dict(found["asked"])
+        stored = dict(found["asked"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{where} is not a result of this experiment", "remove it to measure again") from error
-    now = plain(asked)
-    if differences := sorted(key for key in {*before, *now} if before.get(key) != now.get(key)):
+    requested = plain(asked)
+    if differences := sorted(key for key in {*stored, *requested} if stored.get(key) != requested.get(key)):
         raise OptionError(
-            f"{where} was measured with other choices ({', '.join(differences)})",
+            f"{where} was measured with other options ({', '.join(differences)})",
             "choose another output folder, or remove it",
         )
     return dict(found)
 
 
 def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a result with the choices that it belongs to, and return both."""
+    """Write a result to the cache together with its options, and return the record."""
     record: dict[str, Any] = plain({"asked": asked, **found})
     make_folder(path.parent)
     with replace_on_success(path) as temporary:
@@ -336,7 +338,7 @@ def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict
 
 
 def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
-    """A kept result, measured and written where there is none: a run that was stopped goes on with what is missing."""
+    """Return a cached result, or measure and cache it; an interrupted run thus continues with what is missing."""
     found = recall(path, asked)
     return keep(path, asked, measure()) if found is None else found
 
@@ -344,5 +346,5 @@ def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str
 def at_work(
     work: Path | None, name: str, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """As `once`, in a file of this name; measured anew where there is no folder for it."""
+    """As `once`, in a file of the folder ``work``; without a folder always measure."""
     return plain(measure()) if work is None else once(work / f"{name}.json", asked, measure)

@@ -1,8 +1,8 @@
-"""Endless generated human bodies: identity, pose, linear blend skinning.
+"""Random human bodies: identity, pose, linear blend skinning.
 
-Random poses stay inside anatomical joint limits, and those in which the body would run into itself are rejected. Angles
-follow the clinical convention (flexion, abduction, twist; see `meshmatch.generators.limbs`). Rotations are expressed in the
-axes of the rest pose (y up, facing +z, left at +x) about the rest joints.
+Random poses stay within anatomical joint limits, and poses with self-intersections are rejected. Angles follow the clinical
+convention (flexion, abduction, twist; see `meshmatch.generators.limbs`). Rotations are expressed in the axes of the rest
+pose (y up, facing +z, left at +x) about the rest joints.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch.nn.functional import normalize as unit
 from meshmatch.arrays import Float, Int
 from meshmatch.errors import OptionError
 from meshmatch.generators.generator import Source
-from meshmatch.generators.limbs import FOLDED, Draw, Limbs, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.generators.limbs import FOLDED, Draw, Limbs, combine_arms_and_legs, draw_arms, draw_limbs, mirror_where
 from meshmatch.generators.momentum_rig import Scanned
 from meshmatch.generators.pose_files import GivenPoses
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, penetration, skin
@@ -30,26 +30,27 @@ from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 
 MAX_BODIES = 20_000
-"""That are drawn once: they are held in memory, 1.4 GB of so many on a template of 6,000 vertices."""
+"""Maximum size of a fixed pool of bodies, which is kept in memory: 1.4 GB on a template of 6,000 vertices."""
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """Which human bodies are generated: on the vertices of a template, of so many different people, some in given poses.
+    """Options of generated human bodies, on the vertices of ``template`` and of ``identities`` different people.
 
-    ``characters`` is the share of those in clothes, of other proportions or built of parts, and ``stylised`` how many of
-    these have the proportions of cartoons; the others are naked. ``bodies`` is how many are drawn, once, and learned from
-    again and again; 0 draws ever new ones. A share of naked bodies may be ``scanned``, in the same poses.
+    ``poses`` are given poses that replace a share of the random ones. ``characters`` is the share of bodies with clothes,
+    other proportions or built of parts, and ``stylised`` the share of these with the proportions of cartoons; all other
+    bodies are naked. ``bodies`` is the size of a fixed pool of bodies to train on; 0 generates new ones in every step.
+    ``scanned`` replaces a share of all bodies with naked ones whose shapes were learned from scans, in random poses.
     """
 
-    template: str | Path | None = None  # the recipe's, see `meshmatch.training.recipes.Recipe`
+    template: str | Path | None = None  # None: the recipe's, see `meshmatch.training.recipes.Recipe`
     identities: int = 4096
     poses: GivenPoses | None = None
-    characters: float | None = None  # the recipe's
-    bodies: int | None = None  # the recipe's
+    characters: float | None = None  # None: the recipe's
+    bodies: int | None = None  # None: the recipe's
     scanned: Scanned | None = None
-    stylised: float | None = None  # the recipe's
-    name: ClassVar[str] = "human"  # of the kind
+    stylised: float | None = None  # None: the recipe's
+    name: ClassVar[str] = "human"  # name of the kind
 
     def __post_init__(self) -> None:
         for share in (self.characters, self.stylised):
@@ -60,26 +61,28 @@ class Bodies:
 
     @property
     def words(self) -> str:
-        """What the card says of them."""
-        few = f"{self.bodies} bodies, drawn once, of " if self.bodies else ""
-        words = f"{few}{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
+        """Description for the model's card."""
+        pool = f"{self.bodies} bodies, drawn once, of " if self.bodies else ""
+        words = f"{pool}{self.identities} generated bodies in sampled poses (anny, Apache-2.0; MakeHuman data, CC0)"
         if self.characters:
-            many = "" if self.stylised is None else f" ({self.stylised:.0%} of these)"
-            words += f", {self.characters:.0%} of them characters: clothed, children, stylised{many} or built of parts"
+            of_these = "" if self.stylised is None else f" ({self.stylised:.0%} of these)"
+            words += (
+                f", {self.characters:.0%} of them characters: clothed, children, stylised{of_these} or built of parts"
+            )
         if self.poses is not None:
             words += f", {self.poses.share:.0%} of them in {self.poses.P} poses of {self.poses.name}"
         if self.scanned is not None:
-            other = "naked bodies of the Momentum Human Rig (Meta, Apache-2.0), its shapes learned from scans"
-            words = f"{1 - self.scanned.share:.0%} {words}; {self.scanned.share:.0%} {other}"
+            source = "naked bodies of the Momentum Human Rig (Meta, Apache-2.0), its shapes learned from scans"
+            words = f"{1 - self.scanned.share:.0%} {words}; {self.scanned.share:.0%} {source}"
         return words
 
 
 def draw_identities(
     rig: Rig, B: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "B V 3"], Float[Tensor, "B J 3"]]:
-    """Blend pairs of stored identities: rest vertices and joints, metres.
+    """Blend random pairs of stored identities; return rest vertices and joints, metres.
 
-    The body model is linear in its coefficients, so a blend of two bodies (and a little beyond) is a body.
+    The body model is linear in its coefficients, so a blend of two bodies, or a slight extrapolation, is a body.
     """
     a, b = torch.randint(len(rig.rest), (2, B), generator=generator)
     blend = torch.rand(B, 1, 1, generator=generator) * 1.2 - 0.1
@@ -89,7 +92,7 @@ def draw_identities(
 def sample_bodies(
     rig: Rig, B: int, generator: torch.Generator, poses: GivenPoses | None = None
 ) -> Float[Tensor, "B V 3"]:
-    """Posed bodies in metres, pelvis roughly upright, y up, facing +z; some in given poses."""
+    """Posed bodies in metres, pelvis approximately upright, y up, facing +z; a share of them in given poses."""
     rest, heads = draw_identities(rig, B, generator)
     world, offset = sample_free_pose(rig, heads, generator)
     if poses is not None:
@@ -104,10 +107,10 @@ def human_source(
     progress: Progress | None = None,
     poses: GivenPoses | None = None,
 ) -> Source:
-    """Generated bodies on a human template's vertices, some in given poses; the rig is built once and cached.
+    """Source of bodies on a human template's vertices, a share of them in given poses; the rig is built once and cached.
 
-    `OptionError` if the template is not made from the body model, or the extra ``train`` is not installed; `InputError` if
-    the body has no joint of a name in ``poses``.
+    `OptionError` if the template was not made from the body model, or the extra ``train`` is not installed; `InputError` if
+    ``poses`` names a joint that the body does not have.
     """
     return partial(sample_bodies, posable_rig(template, identities, seed, progress, poses), poses=poses)
 
@@ -115,19 +118,19 @@ def human_source(
 def posable_rig(
     template: Template, identities: int, seed: int, progress: Progress | None, poses: GivenPoses | None
 ) -> Rig:
-    """`template_rig`, with all joints that are named in ``poses``; errors as `human_source`."""
+    """Return `template_rig`, after checking that it has all joints of ``poses``; errors as `human_source`."""
     rig = template_rig(template, identities, seed, progress)
     if poses is not None:
-        poses.columns(rig)  # checks the names
+        poses.columns(rig)  # raises if the rig lacks a joint
     return rig
 
 
 def template_rig(template: Template, identities: int = 4096, seed: int = 0, progress: Progress | None = None) -> Rig:
-    """The body rig on a human template's vertices, built once and cached; errors as `human_source`, but for poses."""
+    """The body rig on a human template's vertices, built once and cached; `OptionError` as `human_source`."""
     rig = cached_rig(identities, seed, progress)
-    # Template vertices are a subset of the body model's: the dense mesh says which.
-    apart, keep = cKDTree(template.dense.verts).query(template.shape.verts)
-    if template.dense.verts.shape[0] != rig.rest.shape[1] or apart.max() > 1e-4:
+    # Template vertices are a subset of the body model's: find their indices by position in the dense mesh.
+    distance, keep = cKDTree(template.dense.verts).query(template.shape.verts)
+    if template.dense.verts.shape[0] != rig.rest.shape[1] or distance.max() > 1e-4:
         hint = "train on a prepared folder (--shapes), or use a human template"
         raise OptionError(f"template {template.name} is not made from the body model", hint)
     return rig.restricted(keep, np.array(template.shape.faces))
@@ -136,9 +139,9 @@ def template_rig(template: Template, identities: int = 4096, seed: int = 0, prog
 def sample_free_pose(
     rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator, tries: int = 8, tolerance: float = 0.02
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
-    """Of several drawn poses keep the first that is free of self-intersection, else the best.
+    """Draw ``tries`` poses per body and keep the first without self-intersection, else the one with the least.
 
-    Returns the world rotations and offsets of :func:`forward_kinematics`. ``tolerance`` is in units of the torso length.
+    Returns world rotations and offsets as `forward_kinematics` does. ``tolerance`` is in units of the torso length.
     """
     B = heads.shape[0]
     repeated = heads.repeat(tries, 1, 1)
@@ -148,16 +151,19 @@ def sample_free_pose(
 
 
 def first_free(depth: Float[Tensor, " T_times_B"], B: int, tolerance: float) -> Int[Tensor, " B"]:
-    """Of several poses of each body, one after the other, the row of the first that is less deep, else of the best."""
+    """Rows of the first pose of each body with a penetration below ``tolerance``, else of the pose with the least.
+
+    ``depth`` is the penetration of T poses of B bodies; row t B + b is pose t of body b.
+    """
     depth = depth.view(-1, B)
-    order = torch.where(depth < tolerance, torch.arange(len(depth))[:, None] - 1e3, depth)
-    return order.argmin(0) * B + torch.arange(B)
+    score = torch.where(depth < tolerance, torch.arange(len(depth))[:, None] - 1e3, depth)
+    return score.argmin(0) * B + torch.arange(B)
 
 
 def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator) -> Float[Tensor, "B J 3 3"]:
     """Draw one pose per body: the rotation of every joint, in rest axes, relative to its parent.
 
-    ``heads`` are the rest joints of the bodies, metres. Shares and angles are set by hand.
+    ``heads`` are the rest joints of the bodies, metres. Probabilities and angles are set by hand.
     """
     B, J = heads.shape[:2]
     draw = Draw(B, generator)
@@ -168,7 +174,9 @@ def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Genera
     left, right = (draw_limbs(draw, arm, family) for arm in arms)
     same_arms = (torch.rand(B, generator=generator) < 0.3) & (arms[0] != FOLDED)
     same_legs = torch.rand(B, generator=generator) < 0.35
-    right = with_legs(mirrored(left, right, same_arms, draw), mirrored(left, right, same_legs, draw))
+    right = combine_arms_and_legs(
+        mirror_where(left, right, same_arms, draw), mirror_where(left, right, same_legs, draw)
+    )
     matrices = pose_limbs(vectors, rig, heads, left, right, draw)
     flex = draw.choice([0.6, 0.25, 0.15], [draw.normal(4, 10), draw.uniform(-30, 75), draw.normal(35, 20)])
     spine = torch.stack([flex, draw.normal(0, 20), draw.normal(0, 14)], -1) * DEGREE
@@ -184,7 +192,7 @@ def sample_pose(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Genera
 def joint_rotations(
     vectors: Float[Tensor, "B J 3"], matrices: dict[int, Float[Tensor, "B 3 3"]]
 ) -> Float[Tensor, "B J 3 3"]:
-    """Rotations of all joints, by vectors, and of some by matrices."""
+    """Rotation matrices of all joints from rotation vectors; ``matrices`` replaces those of some joints."""
     rotations = rotation_from_vector(vectors)
     for index, rotation in matrices.items():
         rotations[:, index] = rotation
@@ -194,7 +202,10 @@ def joint_rotations(
 def pose_limbs(
     vectors: Float[Tensor, "B J 3"], rig: Rig, heads: Float[Tensor, "B J 3"], left: Limbs, right: Limbs, draw: Draw
 ) -> dict[int, Float[Tensor, "B 3 3"]]:
-    """Write both sides into ``vectors``; returns the rotations of joints that are no single turn."""
+    """Pose arms, legs and hands of both sides.
+
+    Writes the rotation vectors of simple joints into ``vectors``, and returns rotation matrices of the others by joint.
+    """
     matrices: dict[int, Tensor] = {}
     for side, suffix, limbs in ((1.0, ".L", left), (-1.0, ".R", right)):
         _pose_arm(vectors, matrices, rig, heads, side, suffix, limbs, draw)
@@ -220,7 +231,7 @@ def _pose_arm(
     target = torch.stack(
         [side * elevation.sin() * azimuth.cos(), -elevation.cos(), elevation.sin() * azimuth.sin()], -1
     )
-    # The shoulder girdle takes part of every elevation.
+    # The clavicle contributes a part of every arm elevation.
     clavicle = rotation_from_vector(rotation_between(rest_arm, target) * draw.uniform(0.1, 0.3)[:, None])
     local = (clavicle.transpose(1, 2) @ target[..., None])[..., 0]
     matrices[joint("clavicle" + suffix)] = clavicle
@@ -248,14 +259,16 @@ def _pose_leg(
     joint = rig.joint
     hip, knee, ankle = (heads[:, joint(name + suffix)] for name in ("upperleg01", "lowerleg01", "foot"))
     rest_thigh, rest_shin = unit(knee - hip), unit(ankle - knee)
-    flexion, spread = limbs.hip_flexion * DEGREE, limbs.hip_abduction * DEGREE
-    target = torch.stack([side * spread.sin(), -spread.cos() * flexion.cos(), spread.cos() * flexion.sin()], -1)
-    # Flex first, then spread: a plain smallest rotation would roll the knee outwards.
+    flexion, abduction = limbs.hip_flexion * DEGREE, limbs.hip_abduction * DEGREE
+    target = torch.stack(
+        [side * abduction.sin(), -abduction.cos() * flexion.cos(), abduction.cos() * flexion.sin()], -1
+    )
+    # Flex first, then abduct: the smallest rotation to the target would turn the knee outwards.
     flex = rotation_from_vector(-flexion[:, None] * torch.tensor([1.0, 0.0, 0.0]))
     flexed = (flex @ rest_thigh[..., None])[..., 0]
     twist = -side * limbs.hip_twist[:, None] * DEGREE * rest_thigh
-    spreading = rotation_from_vector(rotation_between(flexed, target))
-    matrices[joint("upperleg01" + suffix)] = spreading @ flex @ rotation_from_vector(0.5 * twist)
+    abducting = rotation_from_vector(rotation_between(flexed, target))
+    matrices[joint("upperleg01" + suffix)] = abducting @ flex @ rotation_from_vector(0.5 * twist)
     vectors[:, joint("upperleg02" + suffix)] = 0.5 * twist
     backward = torch.tensor([0.0, 0.0, -1.0]).expand_as(rest_thigh)
     hinge = unit(torch.linalg.cross(rest_thigh, backward))

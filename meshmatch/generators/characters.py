@@ -1,4 +1,4 @@
-"""Generated people of every kind: naked bodies, children, stylised characters, bodies built of parts, in clothes or not."""
+"""Source of generated people: naked bodies, children, stylised characters and bodies built of parts, clothed or not."""
 
 from __future__ import annotations
 
@@ -20,91 +20,111 @@ from meshmatch.generators.bodies import (
 )
 from meshmatch.generators.clothes import dressed, skirted
 from meshmatch.generators.figure import Figure
-from meshmatch.generators.generator import Source, mixed
+from meshmatch.generators.generator import Source, mix_sources
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.pose_files import GivenPoses
-from meshmatch.generators.proportions import PLAIN, SHARES, STYLISED, TOON, draw_style, rounded, shares_with, stretched
+from meshmatch.generators.proportions import (
+    PLAIN,
+    SHARES,
+    STYLISED,
+    TOON,
+    draw_style,
+    rounded,
+    shares_with_stylised,
+    stretched,
+)
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
 from meshmatch.generators.scanned_bodies import scanned_source
 from meshmatch.progress import Progress
 from meshmatch.templates.template import Template
 
-_CLOTHED = 0.75  # of those that are not plain wear something
-_SKIRTS = 0.35  # of these, something around both legs
-_STILL = 0.55  # of stylised and built bodies stand as modellers deliver them
+_CLOTHED_SHARE = 0.75  # share of characters with clothes; those of plain proportions always have some
+_SKIRT_SHARE = 0.35  # share of the clothed with a garment around both legs
+_REST_POSE_SHARE = 0.55  # share of stylised and built bodies in a rest pose such as T or A
 
 
 @dataclass(frozen=True, eq=False)
-class Cast:
-    """Who is generated: bodies of a rig's figure, a share of them other than naked and as the body model has them."""
+class CharacterConfig:
+    """Settings of generated people: the rig's figure, the ``share`` of characters, and the shares of their styles.
+
+    All other bodies are naked, with the proportions of the body model.
+    """
 
     figure: Figure
     share: float
     poses: GivenPoses | None = None
-    kinds: tuple[float, ...] = SHARES
+    style_shares: tuple[float, ...] = SHARES
 
 
 def people_source(template: Template, bodies: Bodies, seed: int = 0, progress: Progress | None = None) -> Source:
-    """Generated people on a human template's vertices; errors as `meshmatch.generators.bodies.human_source`."""
+    """Source of people on a human template's vertices; errors as `meshmatch.generators.bodies.human_source`."""
     if bodies.scanned is not None:
         others = people_source(template, replace(bodies, scanned=None), seed, progress)
-        return mixed(others, scanned_source(template, bodies.scanned, seed), bodies.scanned.share)
+        return mix_sources(others, scanned_source(template, bodies.scanned, seed), bodies.scanned.share)
     if not bodies.characters:
         return human_source(template, bodies.identities, seed, progress, bodies.poses)
     rig = posable_rig(template, bodies.identities, seed, progress, bodies.poses)
-    kinds = shares_with(STYLISED if bodies.stylised is None else bodies.stylised)
-    return partial(sample_characters, Cast(Figure.of(rig), bodies.characters, bodies.poses, kinds))
+    style_shares = shares_with_stylised(STYLISED if bodies.stylised is None else bodies.stylised)
+    return partial(sample_characters, CharacterConfig(Figure.of(rig), bodies.characters, bodies.poses, style_shares))
 
 
-def sample_characters(cast: Cast, B: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
-    """Posed bodies in metres, pelvis roughly upright, y up, facing +z."""
-    return _sample(cast, B, generator)[0]
+def sample_characters(config: CharacterConfig, B: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
+    """Posed bodies in metres, pelvis approximately upright, y up, facing +z."""
+    return _sample(config, B, generator)[0]
 
 
 def sample_layers(
-    cast: Cast, B: int, generator: torch.Generator
+    config: CharacterConfig, B: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "B V 3"], Float[Tensor, "B V 3"]]:
-    """The same bodies as they are seen, and as they are below their clothes."""
-    return _sample(cast, B, generator, below=True)
+    """Posed bodies with their clothes, and the same bodies without."""
+    return _sample(config, B, generator, with_naked=True)
 
 
-def _sample(cast: Cast, B: int, generator: torch.Generator, below: bool = False) -> tuple[Tensor, Tensor]:
-    figure, rig = cast.figure, cast.figure.rig
+def _sample(
+    config: CharacterConfig, B: int, generator: torch.Generator, with_naked: bool = False
+) -> tuple[Tensor, Tensor]:
+    figure, rig = config.figure, config.figure.rig
     rest, heads = draw_identities(rig, B, generator)
-    other = torch.nonzero(torch.rand(B, generator=generator) < cast.share)[:, 0]
-    style = draw_style(B, generator, cast.kinds).rows(other)
-    worn = (torch.rand(B, generator=generator)[other] < _CLOTHED) | (style.kind == PLAIN)
+    characters = torch.nonzero(torch.rand(B, generator=generator) < config.share)[:, 0]
+    style = draw_style(B, generator, config.style_shares).rows(characters)
+    is_clothed = (torch.rand(B, generator=generator)[characters] < _CLOTHED_SHARE) | (style.kind == PLAIN)
     naked = rest
-    if len(other):
-        own, bones = stretched(figure, rest[other], heads[other], style)
-        shaped = torch.nonzero(style.kind >= TOON)[:, 0]
-        if len(shaped):
-            own[shaped] = rounded(figure, own[shaped], bones[shaped], style.kind[shaped], generator)
-        if below:
-            naked = rest.index_copy(0, other, own)
-        if worn.any():
-            own[worn] = dressed(figure, own[worn], bones[worn], generator)
-        rest[other], heads[other] = own, bones
+    if len(characters):
+        shaped_rest, shaped_heads = stretched(figure, rest[characters], heads[characters], style)
+        to_round = torch.nonzero(style.kind >= TOON)[:, 0]
+        if len(to_round):
+            shaped_rest[to_round] = rounded(
+                figure, shaped_rest[to_round], shaped_heads[to_round], style.kind[to_round], generator
+            )
+        if with_naked:
+            naked = rest.index_copy(0, characters, shaped_rest)
+        if is_clothed.any():
+            shaped_rest[is_clothed] = dressed(figure, shaped_rest[is_clothed], shaped_heads[is_clothed], generator)
+        rest[characters], heads[characters] = shaped_rest, shaped_heads
     world, offset = sample_free_pose(rig, heads, generator)
-    if cast.poses is not None:
-        world, offset = cast.poses.mixed(rig, heads, world, offset, generator)
-    still = other[(style.kind >= TOON) & (torch.rand(len(other), generator=generator) < _STILL)]
-    if len(still):
-        world[still], offset[still] = forward_kinematics(rig, heads[still], standing(rig, heads[still], generator))
+    if config.poses is not None:
+        world, offset = config.poses.mixed(rig, heads, world, offset, generator)
+    in_rest_pose = characters[
+        (style.kind >= TOON) & (torch.rand(len(characters), generator=generator) < _REST_POSE_SHARE)
+    ]
+    if len(in_rest_pose):
+        world[in_rest_pose], offset[in_rest_pose] = forward_kinematics(
+            rig, heads[in_rest_pose], sample_rest_poses(rig, heads[in_rest_pose], generator)
+        )
     verts = skin(rig, rest, world, offset)
-    naked = skin(rig, naked, world, offset) if below else verts
-    skirts = other[worn & (torch.rand(len(other), generator=generator) < _SKIRTS)]
+    naked = skin(rig, naked, world, offset) if with_naked else verts
+    skirts = characters[is_clothed & (torch.rand(len(characters), generator=generator) < _SKIRT_SHARE)]
     if len(skirts):
         joints = (world[skirts] @ heads[skirts][..., None])[..., 0] + offset[skirts]
         verts[skirts] = skirted(figure, verts[skirts], heads[skirts], joints, generator)
-    soft = other[worn & (torch.rand(len(other), generator=generator) < 0.5)]
-    if len(soft):
-        verts[soft] = figure.smooth(verts[soft], 6)
+    smoothed = characters[is_clothed & (torch.rand(len(characters), generator=generator) < 0.5)]
+    if len(smoothed):
+        verts[smoothed] = figure.smooth(verts[smoothed], 6)
     return verts, naked
 
 
-def standing(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator) -> Float[Tensor, "B J 3 3"]:
-    """Poses in which modellers deliver characters: T, A and I, and a little away from them."""
+def sample_rest_poses(rig: Rig, heads: Float[Tensor, "B J 3"], generator: torch.Generator) -> Float[Tensor, "B J 3 3"]:
+    """Random rest poses of character models: variations of the T, A and I poses."""
     B, J = heads.shape[:2]
     draw = Draw(B, generator)
     vectors = torch.zeros(B, J, 3)

@@ -1,4 +1,4 @@
-"""What every generator is: a resting shape with its parts, and shapes without end on its vertices, in random poses."""
+"""Base types of generators: a template shape at rest with its parts, and a source of random shapes on its vertices."""
 
 from __future__ import annotations
 
@@ -25,9 +25,11 @@ Source = Callable[[int, torch.Generator], Float[Tensor, "N V 3"]]
 
 @dataclass(frozen=True, eq=False)
 class Generator:
-    """Shapes of a kind: the ``template`` is one at rest, with its parts; ``draw`` gives others on its vertices, of random
-    identities in random poses, a function of the seed. ``data`` is what a model's card says of them, ``mirror`` whether its
-    fits also try mirror images.
+    """A kind of shapes.
+
+    ``template`` is a shape at rest, with its parts. ``draw`` returns shapes on its vertices, with random identities and
+    poses, determined by the seed. ``data`` describes them on a model's card; ``mirror`` is whether fits also try mirror
+    images.
     """
 
     kind: str
@@ -38,10 +40,10 @@ class Generator:
 
 
 @dataclass(frozen=True, eq=False)
-class Resting:
-    """The shape at rest that becomes a kind's template: the part of every vertex, and those that fix the kind's frame."""
+class RestShape:
+    """A shape at rest that becomes a kind's template, with the part of every vertex and the core's vertices."""
 
-    shape: Shape  # named after the kind
+    shape: Shape  # its name is that of the kind
     labels: Int[Ints, " V"]
     parts: tuple[str, ...]
     core: Int[Ints, " C"] | None
@@ -50,58 +52,62 @@ class Resting:
     licence: str = ""
 
     def template(self) -> Template:
-        """The template of the included model of the kind, if it is of this shape; else one that is made."""
+        """Return the template of the bundled model of the kind if it has the same faces, else make a new one."""
         kind = self.shape.name
-        found = shipped_template(kind)
-        if found is not None and np.array_equal(found.dense.faces, self.shape.faces):
-            return found
+        bundled = bundled_template(kind)
+        if bundled is not None and np.array_equal(bundled.dense.faces, self.shape.faces):
+            return bundled
         made = make_template(self.shape, kind, self.nodes, labels=self.labels, label_names=self.parts, core=self.core)
         return replace(made, source=self.source, licence=self.licence)
 
 
-def shipped_template(kind: str) -> Template | None:
-    """The template of the included model of a kind, if there is one."""
-    shipped = bundled_folder() / "models" / kind / "template.safetensors"
-    return read_template(shipped) if shipped.is_file() else None
+def bundled_template(kind: str) -> Template | None:
+    """Template of the bundled model of a kind, if there is one."""
+    path = bundled_folder() / "models" / kind / "template.safetensors"
+    return read_template(path) if path.is_file() else None
 
 
-def any_of(shapes: Float[Tensor, "N V 3"], count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
-    """Some of a fixed set of shapes, drawn with replacement."""
+def draw_any(shapes: Float[Tensor, "N V 3"], count: int, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
+    """Draw ``count`` of N fixed shapes with replacement."""
     return shapes[torch.randint(len(shapes), (count,), generator=generator)]
 
 
-def mixed(first: Source, second: Source, share: float) -> Source:
-    """Draws shapes of the first source and, in random places, a share of the second."""
-    return partial(_of_both, first, second, share)
+def mix_sources(first: Source, second: Source, share: float) -> Source:
+    """Source that draws from two others; each shape is of the second with probability ``share``."""
+    return partial(_draw_mixed, first, second, share)
 
 
-def _of_both(
+def _draw_mixed(
     first: Source, second: Source, share: float, count: int, generator: torch.Generator
 ) -> Float[Tensor, "B V 3"]:
-    other = torch.rand(count, generator=generator) < share
-    drawn = [source(int(rows.sum()), generator) for source, rows in ((first, ~other), (second, other)) if rows.any()]
-    order = torch.argsort(torch.cat([torch.nonzero(~other)[:, 0], torch.nonzero(other)[:, 0]]))
-    return torch.cat(drawn)[order]
+    from_second = torch.rand(count, generator=generator) < share
+    batches = [
+        source(int(rows.sum()), generator)
+        for source, rows in ((first, ~from_second), (second, from_second))
+        if rows.any()
+    ]
+    order = torch.argsort(torch.cat([torch.nonzero(~from_second)[:, 0], torch.nonzero(from_second)[:, 0]]))
+    return torch.cat(batches)[order]
 
 
 def source_on(source: Source, device: torch.device) -> Source | None:
-    """A source of ours that draws on a device, from a generator there; None of others', drawn where they like."""
-    made = source.func if isinstance(source, partial) else type(source)
-    return moved(source, device) if made.__module__.partition(".")[0] == __name__.partition(".")[0] else None
+    """Copy of one of meshmatch's own sources that draws on a device, from a generator there; None for custom sources."""
+    function = source.func if isinstance(source, partial) else type(source)
+    return to_device(source, device) if function.__module__.partition(".")[0] == __name__.partition(".")[0] else None
 
 
-def moved(held: Any, device: torch.device) -> Any:
-    """The same value, every tensor in it on a device: in dataclasses, tuples, modules and calls that are partly given."""
-    if isinstance(held, Tensor):
-        return held.to(device)
-    if isinstance(held, torch.nn.Module):
-        return deepcopy(held).to(device)
-    if isinstance(held, partial):
-        given = {name: moved(value, device) for name, value in held.keywords.items()}
-        return partial(held.func, *moved(held.args, device), **given)
-    if type(held) is tuple:
-        return tuple(moved(each, device) for each in held)
-    if is_dataclass(held) and not isinstance(held, type):
-        inside = (each.name for each in fields(held) if each.init)
-        return replace(held, **{name: moved(getattr(held, name), device) for name in inside})
-    return held
+def to_device(obj: Any, device: torch.device) -> Any:
+    """Copy of a value with every tensor in it on a device; goes through dataclasses, tuples, modules and partial calls."""
+    if isinstance(obj, Tensor):
+        return obj.to(device)
+    if isinstance(obj, torch.nn.Module):
+        return deepcopy(obj).to(device)
+    if isinstance(obj, partial):
+        keywords = {name: to_device(value, device) for name, value in obj.keywords.items()}
+        return partial(obj.func, *to_device(obj.args, device), **keywords)
+    if type(obj) is tuple:
+        return tuple(to_device(each, device) for each in obj)
+    if is_dataclass(obj) and not isinstance(obj, type):
+        names = (each.name for each in fields(obj) if each.init)
+        return replace(obj, **{name: to_device(getattr(obj, name), device) for name in names})
+    return obj

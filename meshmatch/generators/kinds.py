@@ -1,4 +1,4 @@
-"""The kinds of shapes that can be generated besides people: their generators by name."""
+"""Registry of the generated kinds other than people: their generators by name."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ GENERATORS: dict[str, Callable[[int, int, Progress | None], Generator]] = {
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of generated shapes, made of so many people, or animals. People are a kind with choices of their own, see
-    `meshmatch.generators.bodies.Bodies`. `OptionError` if there is no such kind.
+    """A kind of generated shapes, made from ``identities`` random people or animals.
+
+    Human bodies have more options, see `meshmatch.generators.bodies.Bodies`. `OptionError` if the name is unknown.
     """
 
     name: str
     identities: int = 1024
 
     def __post_init__(self) -> None:
-        if self.name not in tuple(GENERATORS):  # anything else may not be hashable
+        if self.name not in tuple(GENERATORS):  # a tuple, as the name may not be hashable
             raise OptionError(f"unknown kind {self.name!r}", f"choose from human, {', '.join(GENERATORS)}")
 
     def generator(self, seed: int, progress: Progress | None = None) -> Generator:
-        """A function of the seed. `OptionError` if what the shapes are made from is not installed."""
+        """Build the generator, which is determined by the seed; `OptionError` if a required package is not installed."""
         return GENERATORS[self.name](self.identities, seed, progress)

@@ -1,8 +1,8 @@
-"""Clinical angles of arms and legs, drawn within anatomical limits.
+"""Random clinical angles of arms and legs within anatomical limits.
 
-A mixture of everyday families (standing, reaching, overhead, arms folded, hand at the face; sitting, crouching,
-kneeling, bending, lunging) and of wide uniform ranges, so that rare poses are rare but present. The order of the
-draws is part of what a seed means: changing it changes every training.
+Poses are a mixture of everyday families (standing, reaching, overhead, arms folded, hand at the face; sitting, crouching,
+kneeling, bending, lunging) and of wide uniform ranges, so that rare poses are rare but present. The order of the draws
+determines the poses of a seed: changing it changes every training.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from meshmatch.generators.rotations import DEGREE
 
 @dataclass(frozen=True)
 class Draw:
-    """Shorthand for seeded draws of shape (B,)."""
+    """Seeded random numbers of shape (B,)."""
 
     B: int
     generator: torch.Generator
@@ -32,7 +32,7 @@ class Draw:
         return deviation * DEGREE * torch.randn(self.B, 3, generator=self.generator)
 
     def family(self, weights: Sequence[float]) -> torch.Tensor:
-        """Numbers that are drawn as often as their weights say."""
+        """Random indices with probabilities proportional to ``weights``."""
         return torch.multinomial(torch.tensor(weights), self.B, True, generator=self.generator)
 
     def choice(self, weights: Sequence[float], options: list[torch.Tensor]) -> torch.Tensor:
@@ -41,7 +41,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Limbs:
-    """Clinical angles in degrees, each (B,), of one side of the body."""
+    """Clinical angles of the limbs on one side of the body, degrees, each (B,); ``curl`` of the fingers has no unit."""
 
     arm_elevation: torch.Tensor
     arm_azimuth: torch.Tensor
@@ -60,9 +60,9 @@ FOLDED = 5
 
 
 def draw_arms(draw: Draw) -> tuple[torch.Tensor, torch.Tensor]:
-    """Families of both arms, each (B,): hang, spread, forward, overhead, any, folded before the body, at the face.
+    """Pose families of both arms, each (B,): hanging, spread, forward, overhead, any, folded in front, at the face.
 
-    Folded arms come in pairs most of the time: they touch each other, which is what makes them hard.
+    Folded arms mostly come in pairs, in which they touch each other; these are the difficult poses.
     """
     shares = [0.26, 0.15, 0.14, 0.16, 0.15, 0.1, 0.04]
     left, right = (draw.family(shares) for _ in range(2))
@@ -71,8 +71,11 @@ def draw_arms(draw: Draw) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
-    """Angles of one side; ``arm`` (B,) as `draw_arms` gives it, ``family`` (B,) is 0..5: stand, wide, crouch or
-    sit, kneel, bend forward, lunge."""
+    """Draw the angles of one side.
+
+    ``arm`` (B,) is the arm's family as in `draw_arms`. ``family`` (B,) is the legs' family: 0 stand, 1 wide, 2 crouch or
+    sit, 3 kneel, 4 bend forward, 5 lunge.
+    """
     at = torch.arange(draw.B)
     elevation = torch.stack([
         draw.normal(14, 12).abs(), draw.normal(80, 20), draw.normal(80, 28), draw.normal(150, 20),
@@ -84,14 +87,14 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
     ])[arm, at].clamp(-60, 135)  # fmt: skip
     any_elbow = draw.choice([0.45, 0.4, 0.15], [draw.normal(10, 14).abs(), draw.uniform(0, 145), draw.normal(90, 25)])
     elbow = torch.stack([any_elbow] * FOLDED + [draw.normal(95, 26), draw.normal(130, 14)])[arm, at]
-    # A positive twist turns the forearm inwards. An arm that is raised turns outwards in its socket, or palms would
-    # face away from each other overhead.
+    # A positive twist turns the forearm inwards. A raised arm rotates outwards, or the palms would face away from each
+    # other overhead.
     raised = ((elevation - 70) / 80).clamp(0, 1)
     twist = torch.stack([draw.normal(0, 30)] * FOLDED + [draw.normal(45, 24), draw.normal(20, 26)])[arm, at]
     twist = twist - raised * draw.uniform(10, 110)
     any_pronation = draw.choice([0.7, 0.3], [draw.normal(10, 38), draw.uniform(-85, 95)])
     pronation = any_pronation - raised * draw.uniform(0, 50)
-    # Families of the legs: stand, wide, crouch or sit, kneel, bend forward, lunge (left or right first).
+    # Order of the leg families: stand, wide, crouch or sit, kneel, bend forward, lunge (left or right first).
     flexion = torch.stack([
         draw.normal(3, 9), draw.uniform(-35, 125), draw.normal(88, 25), draw.normal(15, 25),
         draw.normal(65, 28), draw.uniform(-35, 100),
@@ -101,7 +104,7 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
         draw.normal(6, 8).abs(), draw.choice([0.5, 0.5], [draw.uniform(0, 145), crouch_knee]),
         crouch_knee, draw.normal(110, 25), draw.normal(10, 12).abs(), draw.uniform(0, 110),
     ])[family, at].clamp(0, 150)  # fmt: skip
-    spread = torch.stack([
+    abduction = torch.stack([
         draw.normal(7, 8), draw.uniform(-15, 55), draw.normal(12, 18), draw.normal(8, 10),
         draw.normal(10, 12), draw.normal(10, 14),
     ])[family, at].clamp(-20, 65)  # fmt: skip
@@ -110,11 +113,11 @@ def draw_limbs(draw: Draw, arm: torch.Tensor, family: torch.Tensor) -> Limbs:
     curls = [draw.uniform(-0.3, 0.35), draw.normal(-0.3, 0.08), draw.uniform(0.4, 1.0)]
     curl = draw.choice([0.5, 0.25, 0.25], curls)
     arms = elevation, azimuth, twist.clamp(-130, 85), elbow.clamp(0, 150), pronation.clamp(-90, 95)
-    return Limbs(*arms, flexion, spread, hip_twist, knee, ankle, curl)
+    return Limbs(*arms, flexion, abduction, hip_twist, knee, ankle, curl)
 
 
-def mirrored(source: Limbs, own: Limbs, mask: torch.Tensor, draw: Draw) -> Limbs:
-    """Where mask holds, a side repeats the other with a few degrees of difference."""
+def mirror_where(source: Limbs, own: Limbs, mask: torch.Tensor, draw: Draw) -> Limbs:
+    """``own`` angles of one side, where ``mask`` is true replaced by those of the other with a few degrees of noise."""
     values = {}
     for name in own.__dataclass_fields__:
         noise = draw.normal(0, 0.03 if name == "curl" else 5)
@@ -125,6 +128,6 @@ def mirrored(source: Limbs, own: Limbs, mask: torch.Tensor, draw: Draw) -> Limbs
 _LEG_FIELDS = ("hip_flexion", "hip_abduction", "hip_twist", "knee", "ankle")
 
 
-def with_legs(arms: Limbs, legs: Limbs) -> Limbs:
-    """The arms of one draw with the legs of another."""
+def combine_arms_and_legs(arms: Limbs, legs: Limbs) -> Limbs:
+    """Combine the arms of one draw with the legs of another."""
     return replace(arms, **{name: getattr(legs, name) for name in _LEG_FIELDS})

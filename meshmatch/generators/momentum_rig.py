@@ -1,7 +1,8 @@
-"""Files of Meta's Momentum Human Rig (MHR, Apache-2.0): bodies whose shapes were learned from scans.
+"""Read Meta's Momentum Human Rig (MHR, Apache-2.0): bodies whose shapes were learned from scans.
 
-Two files of its release are read: ``lod3.fbx`` (mesh, shapes, skeleton, skin weights; binary FBX) and ``compact_v6_1.model``
-(how parameters move joints, and their limits; text). y up, facing +z, the left hand at +x; centimetres there, metres here.
+Two files of its release are read: ``lod3.fbx`` (mesh, blend shapes, skeleton, skin weights; binary FBX) and
+``compact_v6_1.model`` (how parameters move joints, and their limits; text). Frame: y up, facing +z, the left hand at +x. The
+files are in centimetres, everything here in metres.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import interpolate
 
 MESH, PARAMETERS = "lod3.fbx", "compact_v6_1.model"
-_MOST_BYTES = 256 << 20  # of a file, and of all of its arrays
-_DEEPEST = 16  # node within node
+_MAX_BYTES = 256 << 20  # size of a file, and total size of its arrays
+_MAX_DEPTH = 16  # nesting of nodes
 _SCALARS = {"Y": "<h", "C": "<?", "I": "<i", "F": "<f", "D": "<d", "L": "<q"}
 _ARRAYS = {"f": "<f4", "d": "<f8", "i": "<i4", "l": "<i8", "b": "?"}
 _CHANNELS = {"tx": 0, "ty": 1, "tz": 2, "sc": 3}
@@ -30,7 +31,7 @@ _LIMIT = re.compile(r"limit\s+(\w+)\s+minmax\s+\[\s*([-+0-9.e]+)\s*,\s*([-+0-9.e
 
 
 class Node(NamedTuple):
-    """A node of an FBX file: its properties are numbers, bytes or arrays."""
+    """A node of an FBX file; its properties are numbers, bytes or arrays."""
 
     name: str
     properties: list[Any]
@@ -40,22 +41,23 @@ class Node(NamedTuple):
         return [child for child in self.children if child.name == name]
 
     def value(self, name: str) -> Any:
-        """First property of the first child of a name; `LookupError` if there is none."""
+        """First property of the first child with this name; `LookupError` if there is none."""
         return self.all(name)[0].properties[0]
 
     @property
     def label(self) -> str:
-        """Of an object: what it is called."""
+        """Name of an object."""
         return str(self.properties[1].split(b"\0")[0].decode())
 
 
 @dataclass(frozen=True, eq=False)
 class MomentumRig:
-    """A body in its rest pose, metres, and all that changes it.
+    """A body in its rest pose, in metres, with blend shapes, skeleton and skin weights.
 
-    ``shapes`` are offsets of the vertices: 20 of the body, 20 of the head, 5 of the hands, then expressions. A joint lies
-    ``shifts`` from its parent, in whose axes ``turns`` stand; ``scales`` says how far every parameter of bone lengths moves
-    it (m) and by which power of two it grows it; ``limits`` are least and largest values of these.
+    ``shapes`` are offsets of the vertices: 20 of the body, 20 of the head, 5 of the hands, then expressions. ``shifts`` and
+    ``turns`` are the translation and rotation of each joint relative to its parent. ``scales`` are the effects of the
+    parameters of bone lengths on each joint: a translation (metres) and an exponent of two of its scale. ``limits`` are the
+    least and largest values of the parameters.
     """
 
     verts: Float[Floats, "V 3"]
@@ -73,8 +75,9 @@ class MomentumRig:
     def frames(
         self, values: Float[Floats, "B P"], bent: Float[Floats, " J"] | None = None
     ) -> tuple[Float[Floats, "B J 3 3"], Float[Floats, "B J 3"]]:
-        """Axes (with their scale) and places of the joints of bodies with such bone lengths, at rest or with joints ``bent``
-        (radians, about their own z, as fingers bend).
+        """Axes (including scale) and positions of the joints for parameters of bone lengths.
+
+        The bodies are at rest, or have joints ``bent`` about their own z, as fingers bend (radians).
         """
         turns = self.turns
         if bent is not None:
@@ -83,20 +86,20 @@ class MomentumRig:
         axes, places = np.empty((*change.shape[:2], 3, 3)), np.empty((*change.shape[:2], 3))
         for joint, parent in enumerate(self.parents):
             shift = self.shifts[joint] + change[:, joint, :3]
-            own = turns[joint] * np.exp2(change[:, joint, 3])[:, None, None]
+            axes_in_parent = turns[joint] * np.exp2(change[:, joint, 3])[:, None, None]
             if parent < 0:
-                axes[:, joint], places[:, joint] = own, shift
+                axes[:, joint], places[:, joint] = axes_in_parent, shift
             else:
-                axes[:, joint] = axes[:, parent] @ own
+                axes[:, joint] = axes[:, parent] @ axes_in_parent
                 places[:, joint] = np.einsum("bij,bj->bi", axes[:, parent], shift) + places[:, parent]
         return axes, places
 
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """A share of generated people that have shapes learned from scans: bodies of a rig, on the vertices of a template.
+    """Bodies with shapes learned from scans, as a share of generated people, on the T vertices of a template.
 
-    Each of these lies in the rig's triangle ``corners``, with barycentric ``weights``.
+    Each template vertex lies in the rig's triangle ``corners``, with barycentric ``weights``.
     """
 
     rig: MomentumRig
@@ -109,34 +112,34 @@ class Scanned:
             raise OptionError(f"a share must be from 0 to 1, not {self.share:g}")
 
     def place(self, values: Float[Floats, "V D"]) -> Float[Floats, "T D"]:
-        """Values of the rig's vertices, at those of the template."""
+        """Interpolate values of the rig's vertices to those of the template."""
         return interpolate(values, self.corners, self.weights)
 
 
 def read_momentum_rig(folder: str | Path) -> MomentumRig:
-    """Read the two files of a folder.
+    """Read a Momentum rig from its two files.
 
     Parameters
     ----------
     folder
-        With ``lod3.fbx`` and ``compact_v6_1.model``.
+        Folder with ``lod3.fbx`` and ``compact_v6_1.model``.
 
     Returns
     -------
     MomentumRig
-        In metres.
+        The rig, in metres.
 
     Raises
     ------
     InputError
-        A file is missing or is not what it should be.
+        A file is missing or has other contents.
     """
     folder = Path(folder)
     hint = "the folder needs lod3.fbx and compact_v6_1.model of a release of github.com/facebookresearch/MHR"
     raw = []
     for name in (MESH, PARAMETERS):
         try:
-            if (folder / name).stat().st_size > _MOST_BYTES:
+            if (folder / name).stat().st_size > _MAX_BYTES:
                 raise InputError(f"{folder / name} is too large", hint)
             raw.append((folder / name).read_bytes())
         except OSError as error:
@@ -154,18 +157,18 @@ def read_momentum_rig(folder: str | Path) -> MomentumRig:
 
 
 def read_fbx(data: bytes) -> Node:
-    """The nodes of a binary FBX file, below one without a name; `ValueError` or `struct.error` if it is none."""
+    """Parse a binary FBX file into a nameless root node; `ValueError` or `struct.error` if it is invalid."""
     if not data.startswith(b"Kaydara FBX Binary"):
         raise ValueError("no binary FBX file")
-    wide = struct.unpack_from("<I", data, 23)[0] >= 7500
-    return Node("", [], _Reader(data, "<QQQB" if wide else "<IIIB").nodes(27, len(data), 0))
+    is_64_bit = struct.unpack_from("<I", data, 23)[0] >= 7500
+    return Node("", [], _Reader(data, "<QQQB" if is_64_bit else "<IIIB").nodes(27, len(data), 0))
 
 
 class _Reader:
-    """Reads nodes; what is left of the bytes that all arrays together may take is counted."""
+    """Parser of FBX nodes, with a limit on the total size of the arrays."""
 
     def __init__(self, data: bytes, head: str) -> None:
-        self._data, self._head, self._left = data, struct.Struct(head), _MOST_BYTES
+        self._data, self._head, self._bytes_left = data, struct.Struct(head), _MAX_BYTES
 
     def nodes(self, at: int, stop: int, depth: int) -> list[Node]:
         found: list[Node] = []
@@ -174,11 +177,11 @@ class _Reader:
             if end == 0:
                 break
             start = at + self._head.size + name
-            if not (start + length <= end <= stop and depth < _DEEPEST and count <= length):
+            if not (start + length <= end <= stop and depth < _MAX_DEPTH and count <= length):
                 raise ValueError("a node that ends nowhere")
-            own = self._properties(start, start + length, count)
+            properties = self._properties(start, start + length, count)
             label = self._data[start - name : start].decode()
-            found.append(Node(label, own, self.nodes(start + length, end, depth + 1)))
+            found.append(Node(label, properties, self.nodes(start + length, end, depth + 1)))
             at = end
         return found
 
@@ -203,8 +206,8 @@ class _Reader:
 
     def _array(self, raw: bytes, dtype: np.dtype[Any], length: int, packed: int) -> np.ndarray:
         size = length * dtype.itemsize
-        self._left -= size
-        if self._left < 0:
+        self._bytes_left -= size
+        if self._bytes_left < 0:
             raise ValueError("more than a rig has")
         if packed:
             raw = zlib.decompressobj().decompress(raw, size) if size else b""
@@ -212,20 +215,20 @@ class _Reader:
 
 
 def _mesh_and_skeleton(file: Node) -> dict[str, Any]:
-    """Everything of a `MomentumRig` that the FBX file has; `LookupError` and such if it is not there."""
+    """The fields of a `MomentumRig` that the FBX file contains; `LookupError` and others if one is missing."""
     objects = file.all("Objects")[0].children
     links = [tuple(link.properties[1:3]) for link in file.all("Connections")[0].children if link.properties[0] == b"OO"]
 
-    def of(name: str, kind: bytes) -> list[Node]:
+    def objects_of(name: str, kind: bytes) -> list[Node]:
         return [each for each in objects if each.name == name and each.properties[2] == kind]
 
-    mesh = of("Geometry", b"Mesh")[0]
+    mesh = objects_of("Geometry", b"Mesh")[0]
     verts = np.asarray(mesh.value("Vertices"), np.float64).reshape(-1, 3)
     corners = np.asarray(mesh.value("PolygonVertexIndex"), np.int64)
     faces = np.where(corners < 0, ~corners, corners).reshape(-1, 3)
     if not (corners.reshape(-1, 3)[:, 2] < 0).all() or faces.max() >= len(verts):
         raise ValueError("triangles only")
-    blends = sorted(of("Geometry", b"Shape"), key=lambda each: int(each.label.split("_")[1]))
+    blends = sorted(objects_of("Geometry", b"Shape"), key=lambda each: int(each.label.split("_")[1]))
     shapes = np.zeros((len(blends), *verts.shape))
     for row, each in zip(shapes, blends, strict=True):
         row[each.value("Indexes")] = np.asarray(each.value("Vertices")).reshape(-1, 3)
@@ -234,7 +237,7 @@ def _mesh_and_skeleton(file: Node) -> dict[str, Any]:
     number = {bone.properties[0]: index for index, bone in enumerate(bones)}
     parent = {child: above for child, above in links if child in number and above in number}
     parents = tuple(number[parent[each]] if each in parent else -1 for each in number)
-    if any(above >= own for own, above in enumerate(parents)):
+    if any(above >= cluster_node for cluster_node, above in enumerate(parents)):
         raise ValueError("parents come first")
     shifts, turns = np.zeros((len(bones), 3)), np.tile(np.eye(3), (len(bones), 1, 1))
     for index, bone in enumerate(bones):
@@ -242,12 +245,12 @@ def _mesh_and_skeleton(file: Node) -> dict[str, Any]:
         shifts[index] = settings.get(b"Lcl Translation", (0, 0, 0))
         turns[index] = rotation_from_euler(np.radians(settings.get(b"PreRotation", (0, 0, 0))))
 
-    clusters = {each.properties[0]: each for each in of("Deformer", b"Cluster")}
+    clusters = {each.properties[0]: each for each in objects_of("Deformer", b"Cluster")}
     weights = np.zeros((len(verts), len(bones)))
     for bone, cluster in links:
         if cluster in clusters and bone in number and clusters[cluster].all("Indexes"):
-            own = clusters[cluster]
-            weights[own.value("Indexes"), number[bone]] = own.value("Weights")
+            cluster_node = clusters[cluster]
+            weights[cluster_node.value("Indexes"), number[bone]] = cluster_node.value("Weights")
     weights /= weights.sum(1, keepdims=True)
     if not np.isfinite(weights).all():
         raise ValueError("a vertex that no joint moves")
@@ -258,7 +261,7 @@ def _mesh_and_skeleton(file: Node) -> dict[str, Any]:
 
 
 def rotation_from_euler(angles: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
-    """Turned about x, then y, then z; radians."""
+    """Matrix of rotations about x, then y, then z, in radians."""
     (a, b, c), (d, e, f) = np.cos(angles), np.sin(angles)
     about_x = np.array([[1, 0, 0], [0, a, -d], [0, d, a]])
     about_y = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
@@ -269,7 +272,7 @@ def rotation_from_euler(angles: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
 def _bone_lengths(
     text: str, joints: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Float[Floats, "P J 4"], Float[Floats, "P 2"]]:
-    """Parameters whose names begin with ``scale_`` and that may vary: names, effects, limits."""
+    """Names, effects and limits of the variable parameters of bone lengths, whose names start with ``scale_``."""
     lines = [line.split("#")[0].strip() for line in text.splitlines()]
     limits = {
         name: (float(low), float(high)) for name, low, high in (m.groups() for m in map(_LIMIT.match, lines) if m)

@@ -1,8 +1,8 @@
-"""Poses from a file, mixed with the generated ones: npz, json or csv (docs/formats.md).
+"""Read poses from npz, json or csv files (docs/formats.md), and mix them with generated ones.
 
-A pose is a rotation vector (axis times angle, radians) for each joint that the file names; other joints rest.
-Rotations are about the joint's place in the rest pose, in the body's own axes (y up, facing +z, left hand at +x),
-and carry along everything beyond the joint.
+A pose is a rotation vector (axis times angle, radians) for each joint that the file names; other joints are at rest.
+Rotations are about the joint's position in the rest pose, in the body's axes (y up, facing +z, left hand at +x), and move
+everything beyond the joint.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.shapes.input_files import read_json, read_npz, read_text
 
 MAX_BYTES = 60_000_000
-"""A larger file is refused before it is read."""
+"""Maximum size of a file, checked before it is read."""
 MAX_VECTORS = 5_000_000
-"""Poses times joints, of a table."""
-_MAX_NAME_BYTES = 1_000_000  # bytes of an array of names: each becomes a string of its own
+"""Maximum number of poses times joints in a table."""
+_MAX_NAME_BYTES = 1_000_000  # maximum size of an array of names, each of which becomes a Python string
 COLUMNS = ("pose", "joint", "x", "y", "z")
 
 _HINT = "see docs/formats.md for what a file of poses holds"
@@ -37,12 +37,13 @@ _HINT = "see docs/formats.md for what a file of poses holds"
 
 @dataclass(frozen=True, eq=False)
 class GivenPoses:
-    """Poses to learn from besides the generated ones. Valid once built, but for the names of its joints.
+    """Given poses to train on in addition to generated ones.
 
-    J joints of the body rig, each once, and rotation vectors in radians, none longer than a full turn. A ``share`` of the
-    bodies, 0..1, stands in a pose of these; ``name`` is the file's.
+    J unique joints of the body rig, and rotation vectors in radians, none longer than a full turn. A ``share`` of the
+    bodies, 0..1, is in one of these poses; ``name`` is that of the file.
 
-    `InputError` if there is no pose, or names and vectors are not as above; `OptionError` if the share is not in 0..1.
+    `InputError` if there are no poses, or the vectors are invalid, or a joint occurs twice; `OptionError` if the share is
+    not in 0..1. Whether a rig has the joints is checked by `columns`.
     """
 
     joints: tuple[str, ...]
@@ -54,22 +55,22 @@ class GivenPoses:
         vectors = np.asarray(self.vectors)
         if vectors.dtype.kind not in "fiu" or vectors.ndim != 3 or vectors.shape[1:] != (len(self.joints), 3):
             wanted = f"numbers of (poses, {len(self.joints)} joints, 3)"
-            raise InputError(f"rotations are {vectors.dtype} of {_shown(vectors.shape)}, not {wanted}", _HINT)
+            raise InputError(f"rotations are {vectors.dtype} of {_format_shape(vectors.shape)}, not {wanted}", _HINT)
         if vectors.size == 0:
             raise InputError("there are no poses in it", _HINT)
         if len(set(self.joints)) < len(self.joints):
-            twice = next(name for name in self.joints if self.joints.count(name) > 1)
-            raise InputError(f"joint {twice[:80]!r} is named twice", _HINT)
-        with np.errstate(over="ignore"):  # to infinity, which is refused
+            duplicate = next(name for name in self.joints if self.joints.count(name) > 1)
+            raise InputError(f"joint {duplicate[:80]!r} is named twice", _HINT)
+        with np.errstate(over="ignore"):  # overflow gives infinity, which is rejected below
             vectors = vectors.astype(np.float32)
         if not np.isfinite(vectors).all():
             pose, joint, _ = np.argwhere(~np.isfinite(vectors))[0]
             raise InputError(f"pose {pose} has a rotation of {self.joints[joint][:80]!r} that is not a number", _HINT)
-        angle = np.linalg.norm(vectors.astype(np.float64), axis=2)  # the square of 1e30 is no float32
+        angle = np.linalg.norm(vectors.astype(np.float64), axis=2)  # the square of 1e30 overflows float32
         if angle.max() > 2 * math.pi + 1e-3:
             pose, joint = np.unravel_index(int(angle.argmax()), angle.shape)
-            turned = f"pose {pose} turns {self.joints[joint][:80]!r} by {angle[pose, joint]:.4g}"
-            raise InputError(f"{turned}, more than a full turn", "angles are in radians: divide degrees by 57.3")
+            description = f"pose {pose} turns {self.joints[joint][:80]!r} by {angle[pose, joint]:.4g}"
+            raise InputError(f"{description}, more than a full turn", "angles are in radians: divide degrees by 57.3")
         if not 0 <= self.share <= 1:
             raise OptionError(f"a share must be from 0 to 1, not {self.share:g}")
         object.__setattr__(self, "vectors", vectors)
@@ -79,12 +80,12 @@ class GivenPoses:
         return len(self.vectors)
 
     def columns(self, rig: Rig) -> list[int]:
-        """Where each joint stands in a rig; `InputError` if it has no joint of a name."""
-        strangers = [name for name in self.joints if name not in rig.names]
-        if strangers:
-            near = " or ".join(get_close_matches(strangers[0], rig.names, n=3))
+        """Index of each joint in a rig; `InputError` if the rig lacks one."""
+        unknown = [name for name in self.joints if name not in rig.names]
+        if unknown:
+            near = " or ".join(get_close_matches(unknown[0], rig.names, n=3))
             hint = f"did you mean {near}?" if near else "docs/formats.md names all joints"
-            raise InputError(f"the body has no joint {strangers[0][:80]!r}", hint)
+            raise InputError(f"the body has no joint {unknown[0][:80]!r}", hint)
         return [rig.joint(name) for name in self.joints]
 
     def mixed(
@@ -95,21 +96,22 @@ class GivenPoses:
         offset: Float[Tensor, "B J 3"],
         generator: torch.Generator,
     ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
-        """World rotations and offsets of `forward_kinematics`, where a share of the bodies has a pose of these instead."""
+        """Replace the pose of a random share of the bodies; world rotations and offsets are as in `forward_kinematics`."""
         B, J = heads.shape[:2]
-        taken = torch.rand(B, generator=generator) < self.share
+        replaced = torch.rand(B, generator=generator) < self.share
         pick = torch.randint(self.P, (B,), generator=generator)
         vectors = torch.zeros(B, J, 3)
         vectors[:, self.columns(rig)] = torch.tensor(self.vectors)[pick]
-        own_world, own_offset = forward_kinematics(rig, heads, rotation_from_vector(vectors))
-        taken = taken[:, None, None]
-        return torch.where(taken[..., None], own_world, world), torch.where(taken, own_offset, offset)
+        given_world, given_offset = forward_kinematics(rig, heads, rotation_from_vector(vectors))
+        replaced = replaced[:, None, None]
+        return torch.where(replaced[..., None], given_world, world), torch.where(replaced, given_offset, offset)
 
 
 def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
-    """Read a file of poses; the suffix says which kind it is.
+    """Read a file of poses; the format is determined by the suffix.
 
-    `InputError` if it is missing, too large or damaged, of another kind, or holds no poses; else as `GivenPoses`.
+    `InputError` if the file is missing, too large, damaged, of another format or without poses; other errors as
+    `GivenPoses`.
     """
     path = Path(path)
     read = _READERS.get(path.suffix.lower())
@@ -130,18 +132,18 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
 
 
 def _read_npz(path: Path) -> tuple[list[Any], Any]:
-    """Arrays `joints` (J,) of text and `rotations` (P, J, 3)."""
+    """Read arrays `joints` (J,) of strings and `rotations` (P, J, 3)."""
     found = read_npz(path, ("joints", "rotations"))
     joints = _entry(found, "joints")
     if joints.dtype.kind not in "US" or joints.ndim != 1:
-        raise ValueError(f"joints are {joints.dtype} of {_shown(joints.shape)}, not a list of names")
+        raise ValueError(f"joints are {joints.dtype} of {_format_shape(joints.shape)}, not a list of names")
     if max(joints.nbytes, len(joints)) > _MAX_NAME_BYTES:
         raise ValueError(f"{len(joints)} joints of {joints.dtype} are too many")
     return joints.astype(np.str_).tolist(), _entry(found, "rotations")
 
 
 def _read_json(path: Path) -> tuple[list[Any], Any]:
-    """An object with `joints`, a list of names, and `rotations`, lists of numbers."""
+    """Read an object with `joints`, a list of names, and `rotations`, nested lists of numbers."""
     found: Any = read_json(path)
     if not isinstance(found, dict):
         raise ValueError("it is not an object with joints and rotations")
@@ -155,7 +157,7 @@ def _read_json(path: Path) -> tuple[list[Any], Any]:
 
 
 def _read_csv(path: Path) -> tuple[list[Any], Any]:
-    """A row `pose, joint, x, y, z` for each joint that is turned; rows of one pose have the same first word."""
+    """Read rows of `pose, joint, x, y, z`, one for each rotated joint; rows of one pose have the same first entry."""
     poses: dict[str, int] = {}
     joints: dict[str, int] = {}
     turns: dict[tuple[int, int], list[float]] = {}
@@ -167,18 +169,18 @@ def _read_csv(path: Path) -> tuple[list[Any], Any]:
             if len(row) != len(COLUMNS):
                 raise ValueError(f"line {rows.line_num} has {len(row)} columns, not {len(COLUMNS)}")
             pose, joint = (word.strip() for word in row[:2])
-            at = poses.setdefault(pose, len(poses)), joints.setdefault(joint, len(joints))
-            if at in turns:
+            key = poses.setdefault(pose, len(poses)), joints.setdefault(joint, len(joints))
+            if key in turns:
                 raise ValueError(f"line {rows.line_num} turns {joint[:80]!r} of pose {pose[:80]!r} again")
             try:
-                turns[at] = [float(word) for word in row[2:]]
+                turns[key] = [float(word) for word in row[2:]]
             except ValueError:
                 raise ValueError(f"line {rows.line_num} has words where numbers belong") from None
     if len(poses) * len(joints) > MAX_VECTORS:
         raise ValueError(f"{len(poses)} poses of {len(joints)} joints are too many")
     vectors = np.zeros((len(poses), len(joints), 3))
-    for at, turn in turns.items():
-        vectors[at] = turn
+    for key, turn in turns.items():
+        vectors[key] = turn
     return list(joints), vectors
 
 
@@ -188,7 +190,7 @@ def _entry(found: dict[str, Any], name: str) -> Any:
     return found[name]
 
 
-def _shown(shape: tuple[int, ...]) -> str:
+def _format_shape(shape: tuple[int, ...]) -> str:
     return " x ".join(str(n) for n in shape) or "no shape"
 
 

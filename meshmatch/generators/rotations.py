@@ -25,11 +25,11 @@ def rotation_from_vector(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3
 
 
 def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """Smallest rotation that takes unit vectors a to b, as rotation vectors."""
+    """Smallest rotations that take unit vectors a to b, as rotation vectors."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
     cosine = (a * b).sum(-1, keepdim=True)
-    # Half a turn has no axis of its own: any that is perpendicular will do.
+    # For opposite vectors any perpendicular axis is valid.
     other = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
     across = normalize(torch.linalg.cross(a, other), dim=-1)
     half = (sine < 1e-6) & (cosine < 0)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float
-from meshmatch.generators.generator import moved, source_on
+from meshmatch.generators.generator import source_on, to_device
 from meshmatch.training.datasets import BatchDataset, CloudDataset, step_generator
 
 Draw = Literal["auto", "cpu", "device"]
@@ -49,9 +49,11 @@ def batches(
 def on_device(data: Any, device: torch.device) -> Any:
     """Copy of a `BatchDataset` or `CloudDataset` with its tensors, and copies of its encoders, on a device."""
     if isinstance(data, CloudDataset):
-        return moved(data, device)
+        return to_device(data, device)
     source = data.source
-    return replace(moved(replace(data, source=_placeholder_source), device), source=source_on(source, device) or source)
+    return replace(
+        to_device(replace(data, source=_placeholder_source), device), source=source_on(source, device) or source
+    )
 
 
 def _placeholder_source(count: int, generator: torch.Generator) -> Tensor:

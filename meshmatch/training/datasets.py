@@ -18,7 +18,7 @@ from meshmatch.arrays import Float, Floats, Int
 from meshmatch.errors import InputError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import build_field
-from meshmatch.generators.generator import Source, any_of
+from meshmatch.generators.generator import Source, draw_any
 from meshmatch.models.layers import BasisEncoder, Encoder
 from meshmatch.progress import Progress
 from meshmatch.templates.prepared_folder import ShapeSamples
@@ -36,7 +36,7 @@ _MAX_POINTS = 400_000  # data sets with more points need no deformation, and get
 
 def registered_source(shapes: Float[Tensor, "N V 3"]) -> Source:
     """Source that draws from a fixed set of registered shapes with replacement."""
-    return partial(any_of, shapes - shapes.mean(1, keepdim=True))
+    return partial(draw_any, shapes - shapes.mean(1, keepdim=True))
 
 
 def fixed_pool(source: Source, count: int, seed: int, progress: Progress) -> Source:

@@ -13,7 +13,7 @@ import torch
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
-from meshmatch.generators.generator import Source, shipped_template
+from meshmatch.generators.generator import Source, bundled_template
 from meshmatch.generators.kinds import Kind
 from meshmatch.generators.proportions import STYLISED
 from meshmatch.models.registry import TEMPLATE
@@ -124,7 +124,7 @@ def template_of(
     if shapes is not None:
         return read_template(as_path(shapes) / TEMPLATE)
     if isinstance(kind, Kind):
-        return None if start.template.name == kind.name else shipped_template(kind.name)
+        return None if start.template.name == kind.name else bundled_template(kind.name)
     return read_template((kind.template if kind else None) or recipe.template)
 
 

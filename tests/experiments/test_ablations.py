@@ -370,7 +370,7 @@ def test_the_command_goes_on(
     capsys.readouterr()
     words[words.index("figure9")] = "figure10"
     assert ablations.main([*words, "--rows", str(saved), "--shapes", "3"]) == 1
-    assert "was measured with other choices (measure)" in capsys.readouterr().err
+    assert "was measured with other options (measure)" in capsys.readouterr().err
     assert ablations.main([*words, "--rows", str(output / lacking)]) == 1
     assert "holds no rows of ablations" in capsys.readouterr().err
 

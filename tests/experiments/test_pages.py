@@ -51,7 +51,7 @@ def test_a_page_names_the_last_commit_of_a_command_that_is_gone(tmp_path: Path) 
     record = {"date": "d", "commit": "c", "machine": "m", "last_commit": "abc1234"}
     record |= {"tables": [{"columns": ["a"], "rows": [["1"]]}]}
     (tmp_path / "results" / "few.json").write_text(json.dumps(record))
-    assert pages.table_of("few 1", tmp_path).endswith("d, commit c, m; to repeat it, check out abc1234.\n\n")
+    assert pages.build_table("few 1", tmp_path).endswith("d, commit c, m; to repeat it, check out abc1234.\n\n")
 
 
 def test_a_file_that_an_experiment_writes_has_the_same_form() -> None:
@@ -78,7 +78,7 @@ def test_a_page_that_differs_from_its_files_is_told_and_then_made(tmp_path: Path
     assert "| b |\n|---|\n| 2 |\n" in text and "old" not in text and text.endswith("after\n")
     assert pages.main(["--check", "--docs", str(tmp_path)]) == 0
     twice = "<!-- results few 1: a -->\n<!-- end -->\n<!-- results few 1: b -->\n<!-- end -->\n"
-    first, second = pages.refreshed(twice, tmp_path).split("<!-- end -->\n")[:2]
+    first, second = pages.update_tables(twice, tmp_path).split("<!-- end -->\n")[:2]
     assert "d, commit c, m." in first and second.endswith("(results/few.json), as above.\n\n") and "| 2 |" in second
     (tmp_path / "results" / "few.json").write_text("{}")
     with pytest.raises(InputError, match="few"):

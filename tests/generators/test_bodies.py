@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.errors import OptionError
 from meshmatch.experiments.makers.human_bodies import Still, body_parts, human_template, standing_body, still_pose
 from meshmatch.generators.bodies import draw_identities, sample_bodies, sample_free_pose, sample_pose
-from meshmatch.generators.limbs import FOLDED, Draw, draw_arms, draw_limbs, mirrored, with_legs
+from meshmatch.generators.limbs import FOLDED, Draw, combine_arms_and_legs, draw_arms, draw_limbs, mirror_where
 from meshmatch.generators.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin
 from meshmatch.generators.rotations import rotation_between, rotation_from_vector
 from tests.generators.stick import seeded, stick_figure
@@ -186,10 +186,10 @@ def test_a_mirrored_side_is_nearly_the_other() -> None:
     hanging = standing = torch.zeros(500).long()
     left, right = draw_limbs(draw, hanging, standing), draw_limbs(draw, hanging, standing)
     mask = torch.arange(500) < 250
-    both = mirrored(left, right, mask, draw)
+    both = mirror_where(left, right, mask, draw)
     assert (both.elbow - left.elbow)[mask].abs().mean() < 6
     assert torch.equal(both.elbow[~mask], right.elbow[~mask])
-    mixed = with_legs(left, right)
+    mixed = combine_arms_and_legs(left, right)
     assert torch.equal(mixed.knee, right.knee)
     assert torch.equal(mixed.elbow, left.elbow)
     assert torch.equal(mixed.curl, left.curl)

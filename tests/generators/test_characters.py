@@ -7,7 +7,7 @@ import torch
 
 from meshmatch.errors import OptionError
 from meshmatch.generators.bodies import Bodies, sample_bodies
-from meshmatch.generators.characters import Cast, sample_characters, sample_layers, standing
+from meshmatch.generators.characters import CharacterConfig, sample_characters, sample_layers, sample_rest_poses
 from meshmatch.generators.clothes import dressed, skirted
 from meshmatch.generators.figure import PARTS, Figure, joints_of, part
 from meshmatch.generators.proportions import (
@@ -20,7 +20,7 @@ from meshmatch.generators.proportions import (
     Style,
     draw_style,
     rounded,
-    shares_with,
+    shares_with_stylised,
     stretched,
 )
 from meshmatch.generators.rig import Rig, forward_kinematics
@@ -195,22 +195,22 @@ def test_skirts_close_between_legs_that_are_together_and_leave_a_split_alone() -
 
 
 def test_people_are_a_function_of_the_seed_and_of_the_share(figure: Figure) -> None:
-    cast = Cast(figure, 0.5)
+    cast = CharacterConfig(figure, 0.5)
     first, again = (sample_characters(cast, 12, seeded(3)) for _ in range(2))
     assert torch.equal(first, again)
     assert torch.isfinite(first).all()
     assert not torch.equal(first, sample_characters(cast, 12, seeded(4)))
-    none = sample_characters(Cast(figure, 0.0), 6, seeded(3))
+    none = sample_characters(CharacterConfig(figure, 0.0), 6, seeded(3))
     assert none.shape == sample_bodies(figure.rig, 6, seeded(3)).shape
-    clothed, naked = sample_layers(Cast(figure, 1.0, kinds=(1.0, 0, 0, 0, 0)), 12, seeded(3))
+    clothed, naked = sample_layers(CharacterConfig(figure, 1.0, style_shares=(1.0, 0, 0, 0, 0)), 12, seeded(3))
     assert not torch.equal(clothed, naked)
-    clothed, naked = sample_layers(Cast(figure, 0.0), 12, seeded(3))
+    clothed, naked = sample_layers(CharacterConfig(figure, 0.0), 12, seeded(3))
     assert torch.equal(clothed, naked)
 
 
 def test_more_are_stylised_and_the_others_as_they_were_to_each_other() -> None:
-    assert shares_with(STYLISED) == SHARES
-    shares = shares_with(0.4)
+    assert shares_with_stylised(STYLISED) == SHARES
+    shares = shares_with_stylised(0.4)
     assert shares[TOON] == 0.4 and sum(shares) == pytest.approx(1)
     assert [each / shares[PLAIN] for each in shares[1:TOON]] == pytest.approx(
         [each / SHARES[PLAIN] for each in SHARES[1:TOON]]
@@ -221,7 +221,7 @@ def test_more_are_stylised_and_the_others_as_they_were_to_each_other() -> None:
 
 def test_modellers_poses_have_legs_down_and_arms_between_hanging_and_level(figure: Figure) -> None:
     _, heads = resting(figure, 100)
-    world, offset = forward_kinematics(figure.rig, heads, standing(figure.rig, heads, seeded()))
+    world, offset = forward_kinematics(figure.rig, heads, sample_rest_poses(figure.rig, heads, seeded()))
     joints = (world @ heads[..., None])[..., 0] + offset
     hip, foot, shoulder, wrist = (
         joints[:, joint(figure, name)] for name in ("upperleg01.L", "foot.L", "upperarm01.L", "wrist.L")

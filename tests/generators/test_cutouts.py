@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshmatch.generators.cutouts import Cutout, Region, Stump, lay_cutout, of_joints, open_loop
+from meshmatch.generators.cutouts import Cutout, Region, Stump, boundary_loop, build_cutout, restrict_to_region
 from tests.generators.stick import stick_figure
 
 STUMP = Stump(np.zeros(3), np.array([0.0, -1.0, 0.0]), 0.2, 0.05, 0.5, (0.3, 0.3))
@@ -24,7 +24,7 @@ def tube(around: int = 12, rows: int = 15) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def cutout() -> Cutout:
-    return lay_cutout(*tube(), STUMP, STUMP.draw_cuts(6))
+    return build_cutout(*tube(), STUMP, STUMP.draw_cuts(6))
 
 
 def test_cuts_lie_within_their_limits() -> None:
@@ -40,7 +40,7 @@ def test_every_shape_ends_at_its_cut(cutout: Cutout) -> None:
     verts, _ = tube()
     cuts = STUMP.draw_cuts(6)
     shapes = cutout.cut(torch.from_numpy(verts).float()[None].expand(7, -1, -1), torch.arange(7)).numpy()
-    loop = open_loop(cutout.faces)
+    loop = boundary_loop(cutout.faces)
     assert len(loop) == 12
     assert np.abs(shapes[0, loop, 1] + 0.2).max() < 1e-6
     for shape, (where, *slopes) in zip(shapes, cuts, strict=True):
@@ -64,7 +64,7 @@ def test_a_place_on_the_stump_is_one_of_the_body(cutout: Cutout) -> None:
 
 def test_a_region_keeps_its_joints_alone() -> None:
     rig = stick_figure()
-    arm = of_joints(rig, Region("arm", "lowerarm01.R", ("lowerarm02", "wrist", "finger"), ".R"))
+    arm = restrict_to_region(rig, Region("arm", "lowerarm01.R", ("lowerarm02", "wrist", "finger"), ".R"))
     assert set(arm.names) == {
         n for n in rig.names if n.endswith(".R") and n.startswith(("lowerarm", "wrist", "finger"))
     }

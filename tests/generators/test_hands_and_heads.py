@@ -10,7 +10,7 @@ import torch
 
 from meshmatch.errors import OptionError
 from meshmatch.generators import rig as rigs
-from meshmatch.generators.cutouts import open_loop
+from meshmatch.generators.cutouts import boundary_loop
 from meshmatch.generators.generator import Generator
 from meshmatch.generators.hands import LIMITS, THUMB_LIMITS, HandAngles, draw_angles
 from meshmatch.generators.heads import LIMITS as HEAD_LIMITS
@@ -82,7 +82,7 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_shapes_are_open_at_the_cut_alone(made: Generator) -> None:
     template = made.template
     faces = np.asarray(template.shape.faces)
-    assert open_loop(faces).size > 8
+    assert boundary_loop(faces).size > 8
     drawn = made.draw(6, seeded())
     assert drawn.shape == (6, template.shape.V, 3)
     assert torch.isfinite(drawn).all()

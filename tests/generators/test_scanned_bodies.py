@@ -14,11 +14,18 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.generators import characters
 from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
-from meshmatch.generators.generator import Source, mixed
+from meshmatch.generators.generator import Source, mix_sources
 from meshmatch.generators.momentum_rig import MomentumRig, Scanned, read_momentum_rig
 from meshmatch.generators.rig import forward_kinematics
 from meshmatch.generators.rotations import rotation_from_vector
-from meshmatch.generators.scanned_bodies import Skinned, half_of, random_people, sample_scanned, scanned_source, skinned
+from meshmatch.generators.scanned_bodies import (
+    TwistingRig,
+    build_twisting_rig,
+    half_rotation,
+    random_people,
+    sample_scanned,
+    scanned_source,
+)
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.templates.template import read_template
 from tests.fitting.eggs import egg_template
@@ -48,8 +55,8 @@ def on_own_vertices(rig: MomentumRig, share: float = 0.5) -> Scanned:
 
 
 @pytest.fixture(scope="module")
-def people(rig: MomentumRig) -> Skinned:
-    return skinned(on_own_vertices(rig), rig.faces, 5, 0)
+def people(rig: MomentumRig) -> TwistingRig:
+    return build_twisting_rig(on_own_vertices(rig), rig.faces, 5, 0)
 
 
 def test_both_files_are_read(rig: MomentumRig, folder: Path) -> None:
@@ -92,12 +99,12 @@ def test_people_vary_within_the_limits(rig: MomentumRig) -> None:
     assert np.array_equal(verts, again)
 
 
-def test_skin_weights_are_shared_out_whole(people: Skinned) -> None:
+def test_skin_weights_are_shared_out_whole(people: TwistingRig) -> None:
     total = people.rig.weights.sum(1) + sum(twist.weights.sum(1) for twist in people.twists)
     assert torch.allclose(total, torch.ones(len(total)))
 
 
-def test_a_limb_twists_along_its_length(rig: MomentumRig, people: Skinned) -> None:
+def test_a_limb_twists_along_its_length(rig: MomentumRig, people: TwistingRig) -> None:
     own, rest, heads = people.rig, people.rig.rest[:1].float(), people.rig.heads[:1]
     rotations = torch.eye(3).repeat(1, len(own.names), 1, 1)
     elbow, pronated = own.joint("lowerarm01.L"), own.joint("lowerarm02.L")
@@ -118,7 +125,7 @@ def test_a_limb_twists_along_its_length(rig: MomentumRig, people: Skinned) -> No
     assert angle("r_wrist") == pytest.approx(0, abs=1e-3) and angle("l_uparm_twist2_proc") == pytest.approx(0, abs=1e-3)
 
 
-def test_the_upper_arm_does_not_twist_at_the_shoulder(rig: MomentumRig, people: Skinned) -> None:
+def test_the_upper_arm_does_not_twist_at_the_shoulder(rig: MomentumRig, people: TwistingRig) -> None:
     own, rest, heads = people.rig, people.rig.rest[:1].float(), people.rig.heads[:1]
     rotations = torch.eye(3).repeat(1, len(own.names), 1, 1)
     first, second = own.joint("upperarm01.R"), own.joint("upperarm02.R")
@@ -132,10 +139,10 @@ def test_the_upper_arm_does_not_twist_at_the_shoulder(rig: MomentumRig, people: 
 
 def test_half_of_a_turn() -> None:
     vectors = torch.randn(20, 3, generator=seeded(1))
-    assert torch.allclose(half_of(rotation_from_vector(vectors)), rotation_from_vector(vectors / 2), atol=1e-4)
+    assert torch.allclose(half_rotation(rotation_from_vector(vectors)), rotation_from_vector(vectors / 2), atol=1e-4)
 
 
-def test_posed_bodies_are_a_function_of_the_seed(people: Skinned) -> None:
+def test_posed_bodies_are_a_function_of_the_seed(people: TwistingRig) -> None:
     drawn = sample_scanned(people, 6, seeded(3))
     assert drawn.shape == (6, people.rig.rest.shape[1], 3) and torch.isfinite(drawn).all()
     assert torch.equal(drawn, sample_scanned(people, 6, seeded(3)))
@@ -146,12 +153,12 @@ def test_a_share_of_the_bodies_is_of_the_other_source() -> None:
     def of(value: float) -> Source:
         return lambda count, generator: torch.full((count, 2, 3), value)
 
-    drawn = mixed(of(1.0), of(2.0), 0.25)(4000, seeded(0))[:, 0, 0]
+    drawn = mix_sources(of(1.0), of(2.0), 0.25)(4000, seeded(0))[:, 0, 0]
     assert set(drawn.tolist()) == {1.0, 2.0}
     assert float((drawn == 2).float().mean()) == pytest.approx(0.25, abs=0.03)
     assert (drawn[:100] == 2).any() and (drawn[-100:] == 2).any()
-    assert (mixed(of(1.0), of(2.0), 0.0)(9, seeded(0)) == 1).all() and (
-        mixed(of(1.0), of(2.0), 1.0)(9, seeded(0)) == 2
+    assert (mix_sources(of(1.0), of(2.0), 0.0)(9, seeded(0)) == 1).all() and (
+        mix_sources(of(1.0), of(2.0), 1.0)(9, seeded(0)) == 2
     ).all()
 
 

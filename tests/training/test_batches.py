@@ -11,9 +11,9 @@ from torch import Tensor
 
 from meshmatch.errors import OptionError
 from meshmatch.generators.bodies import sample_bodies
-from meshmatch.generators.characters import Cast, sample_characters
+from meshmatch.generators.characters import CharacterConfig, sample_characters
 from meshmatch.generators.figure import Figure
-from meshmatch.generators.generator import Source, any_of, mixed, moved, source_on
+from meshmatch.generators.generator import Source, draw_any, mix_sources, source_on, to_device
 from meshmatch.models.layers import nearest_index, nearest_of_all
 from meshmatch.templates.template import Template
 from meshmatch.training import recipes
@@ -53,7 +53,7 @@ def sources(egg: Template) -> dict[str, Source]:
     return {
         "registered": registered,
         "deformed": deformed_source(eggs(egg)),
-        "mixed": mixed(registered, partial(any_of, 2 * eggs(egg)), 0.5),
+        "mixed": mix_sources(registered, partial(draw_any, 2 * eggs(egg)), 0.5),
         "anybody's": bent_eggs(egg),
     }
 
@@ -119,7 +119,7 @@ def test_clouds_and_people_are_drawn_there_too(clouds: CloudDataset) -> None:
 
 
 def test_all_of_a_source_moves(egg: Template) -> None:
-    cast = partial(sample_characters, Cast(Figure.of(stick_figure(3)), 0.5))
+    cast = partial(sample_characters, CharacterConfig(Figure.of(stick_figure(3)), 0.5))
     for source in (cast, *list(sources(egg).values())[:3]):
         there = source_on(source, META)
         assert held(there) and all(each.is_meta for each in held(there))
@@ -128,7 +128,7 @@ def test_all_of_a_source_moves(egg: Template) -> None:
     assert source_on(partial(bent_eggs, egg), META) is None
     again = source_on(cast, CPU)
     assert again is not None and torch.equal(again(4, step_generator(0, 1)), cast(4, step_generator(0, 1)))
-    assert moved("word", META) == "word"
+    assert to_device("word", META) == "word"
 
 
 @pytest.mark.parametrize("D", [3, 6])

@@ -1,1 +1,1 @@
-"""What makes templates, rigs, and generated shapes with known correspondence."""
+"""Programs that make templates, rigs, and generated shapes with known correspondence."""

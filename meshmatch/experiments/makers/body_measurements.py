@@ -1,12 +1,12 @@
-"""The body that ``meshmatch measure body`` measures by: the template of ``human`` in meters, standing on the floor, with
+"""Make the reference body of ``meshmatch measure body``: the template of ``human`` in meters, standing on the floor, with
 landmarks and measurements.
 
     python -m meshmatch.experiments.makers.body_measurements -o templates/measurements
 
-A landmark is where a ray from within the body, at a place in centimeters that was chosen
-by looking at sections, leaves it; or the outermost vertex of a part. Girths are defined as tailors and anthropometrists take
-them (ISO 8559-1 has most of these), at the places of the template: where it is narrowest between ribs and hips, widest
-around seat and calf, and so on.
+A landmark is the point where a ray from inside the body leaves it, or the outermost vertex of a part. The origins of the
+rays, in centimeters, were chosen from cross sections. Girths are those of tailoring and anthropometry (most are in
+ISO 8559-1), at positions chosen on the template: where it is narrowest between ribs and hips, widest around seat and calf,
+and so on.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
 
-_SKIN = 1.9  # square meters
-# From where within the body, in centimeters (x to its left, y up from the floor, z ahead), and in which direction.
+_SKIN_AREA = 1.9  # square meters
+# Origin of each ray in centimeters (x to the body's left, y up from the floor, z ahead), and its direction.
 _MIDDLE = {
     "forehead": ((0, 168, 3), (0, 0, 1)),
     "chin": ((0, 155, 3), (0, 0, 1)),
@@ -38,7 +38,7 @@ _MIDDLE = {
     "waist back": ((0, 113.5, 0), (0, 0, -1)),
     "crotch": ((0, 95, -1.5), (0, -1, 0)),
 }
-_LEFT = {  # x and the direction's x change signs on the right; "in" is towards the middle
+_LEFT = {  # the right side has the mirror images, with x negated
     "hip": ((0, 92.5, -2), (1, 0, 0)),
     "thigh": ((13, 81, -1.5), (0, 0, 1)),
     "knee": ((23.5, 48.5, -3), (0, 0, 1)),
@@ -52,7 +52,7 @@ _LEFT = {  # x and the direction's x change signs on the right; "in" is towards 
     "forearm": ((49, 140, 3), (0, 1, 0)),
     "wrist": ((69.5, 137.5, 7.3), (0, 1, 0)),
 }
-_GIRTHS_OF_MIDDLE = {
+_MIDDLE_GIRTHS = {
     "head": ("forehead", "crotch", "crown"),
     "neck": ("throat", "nape", "crown"),
     "chest": ("chest", "crotch", "crown"),
@@ -77,34 +77,37 @@ _LENGTHS = {
 
 
 def _landmarks(body: Shape) -> dict[str, Float[Floats, " 3"]]:
-    found = {"crown": body.verts[body.verts[:, 1].argmax()]}
-    found |= {name: _leaves(body, *ray) for name, ray in _MIDDLE.items()}
+    landmarks = {"crown": body.verts[body.verts[:, 1].argmax()]}
+    landmarks |= {name: _exit_point(body, *ray) for name, ray in _MIDDLE.items()}
     for side, sign in (("left", 1), ("right", -1)):
         mirror = np.array([sign, 1, 1])
-        found |= {f"{side} {name}": _leaves(body, mirror * start, mirror * way) for name, (start, way) in _LEFT.items()}
+        landmarks |= {
+            f"{side} {name}": _exit_point(body, mirror * start, mirror * direction)
+            for name, (start, direction) in _LEFT.items()
+        }
         foot = body.verts[(sign * body.verts[:, 0] > 0.25) & (body.verts[:, 1] < 0.12)]
-        found |= {f"{side} heel": foot[foot[:, 2].argmin()], f"{side} toe": foot[foot[:, 2].argmax()]}
-        found[f"{side} fingertip"] = body.verts[(sign * body.verts[:, 0]).argmax()]
-    return found
+        landmarks |= {f"{side} heel": foot[foot[:, 2].argmin()], f"{side} toe": foot[foot[:, 2].argmax()]}
+        landmarks[f"{side} fingertip"] = body.verts[(sign * body.verts[:, 0]).argmax()]
+    return landmarks
 
 
-def _leaves(body: Shape, start: ArrayLike, way: ArrayLike) -> Float[Floats, " 3"]:
-    """Where a ray, from a place in centimeters within the body, comes out first: beyond may be the other leg."""
+def _exit_point(body: Shape, start: ArrayLike, direction: ArrayLike) -> Float[Floats, " 3"]:
+    """First intersection of the body's surface with a ray from a point inside it, given in centimeters."""
     corners = body.verts[body.faces]
-    origin, ahead = np.asarray(start) / 100.0, np.asarray(way, np.float64)
+    origin, ray = np.asarray(start) / 100.0, np.asarray(direction, np.float64)
     matrices = np.stack(
-        [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], np.tile(-ahead, (body.F, 1))], axis=2
+        [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], np.tile(-ray, (body.F, 1))], axis=2
     )
-    solved = np.linalg.solve(matrices + 1e-15 * np.eye(3), (origin - corners[:, 0])[:, :, None])[:, :, 0]
-    weights = np.column_stack([1 - solved[:, 0] - solved[:, 1], solved[:, :2]])
-    hit = np.flatnonzero((weights >= -1e-9).all(axis=1) & (solved[:, 2] > 0))
-    first = hit[solved[hit, 2].argmin()]
-    return np.asarray(interpolate(body.verts, body.faces[[first]], weights[[first]])[0])
+    solution = np.linalg.solve(matrices + 1e-15 * np.eye(3), (origin - corners[:, 0])[:, :, None])[:, :, 0]
+    weights = np.column_stack([1 - solution[:, 0] - solution[:, 1], solution[:, :2]])
+    hits = np.flatnonzero((weights >= -1e-9).all(axis=1) & (solution[:, 2] > 0))
+    nearest = hits[solution[hits, 2].argmin()]
+    return np.asarray(interpolate(body.verts, body.faces[[nearest]], weights[[nearest]])[0])
 
 
 def _measurements() -> list[list[str]]:
-    found = [[f"{name} girth", "girth", *landmarks] for name, landmarks in _GIRTHS_OF_MIDDLE.items()]
-    found += [
+    rows = [[f"{name} girth", "girth", *landmarks] for name, landmarks in _MIDDLE_GIRTHS.items()]
+    rows += [
         ["shoulder breadth", "distance", "left shoulder", "right shoulder"],
         ["back length", "distance", "nape", "waist back"],
         ["head height", "distance", "chin", "crown"],
@@ -112,17 +115,17 @@ def _measurements() -> list[list[str]]:
     for side in ("left", "right"):
         for kind, group in (("girth", _GIRTHS), ("distance", _LENGTHS)):
             for name, landmarks in group.items():
-                own = [each if each == "crotch" else f"{side} {each}" for each in landmarks]
-                found.append([f"{side} {name}{' girth' if kind == 'girth' else ''}", kind, *own])
-    return found
+                landmark_names = [each if each == "crotch" else f"{side} {each}" for each in landmarks]
+                rows.append([f"{side} {name}{' girth' if kind == 'girth' else ''}", kind, *landmark_names])
+    return rows
 
 
 @runner.command
 def main(
-    output: Annotated[Path, Option("-o", "--output", help="folder to write; the package has it in templates")],
+    output: Annotated[Path, Option("-o", "--output", help="output folder; in the package it is below templates")],
 ) -> runner.Report:
     template = load_model("human").template.shape
-    verts = template.verts * np.sqrt(_SKIN / template.area)
+    verts = template.verts * np.sqrt(_SKIN_AREA / template.area)
     body = Shape(verts - [0, verts[:, 1].min(), 0], template.faces, "body")
     output.mkdir(parents=True, exist_ok=True)
     save_shape(output / "body.ply", body)

@@ -1,8 +1,8 @@
-"""Bones that look like the lower ends of femurs, with their truth: which point of one is which of another.
+"""Generate bones similar to the lower ends of femurs, with ground-truth correspondence.
 
-A bone is a smooth function on the sphere, so that a direction is the same place on all of them, however each is
-triangulated. They differ in size, in proportions that go with it (allometry), by sex and at random; some have a bump on the
-lateral condyle, which is all that their group differs in. Lengths are in millimetres.
+A bone is a smooth function on the sphere: a direction is the same place on all bones, however each is triangulated. Bones
+differ in size, in proportions that depend on size (allometry), by sex and at random. The bones of one group have a bump on
+the lateral condyle, and no other difference. Lengths are in millimetres.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ LANDMARKS: Mapping[str, tuple[float, float, float]] = {
     "trochlear groove": (0.0, 0.75, -0.66),
     "shaft": (0.0, 0.0, 1.0),
 }
-"""Directions of the places that an anatomist would mark; x is lateral, y in front, z along the shaft."""
+"""Directions of anatomical landmarks; x is lateral, y anterior, z along the shaft."""
 BUMP, HIGH = (0.8, -0.1, -0.6), 3.0
-"""Where bones of the group "bump" have one, and its height."""
-_PLACES = 10  # where bones vary at random, which are the same for all
-_VARY = 0.8  # standard deviation there
+"""Direction and height of the bump of the group "bump"."""
+_PLACES = 10  # number of places with random variation, the same for all bones
+_VARY = 0.8  # standard deviation of the variation
 
 
 @dataclass(frozen=True)
 class Bone:
-    """One bone: what is known of it, and how it varies at random; ``size`` is 1 for a usual one."""
+    """One bone: its metadata, relative ``size``, and the random variation at each of P places."""
 
     name: str
     size: float
@@ -54,13 +54,13 @@ class Bone:
     varies: Float[Floats, " P"]
 
     def points(self, directions: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        """Where places are, given as unit vectors, on the right bone as it stands; a left one is its mirror image."""
+        """Points in the given directions (unit vectors), as on a right bone; a left bone is the mirror image."""
         x, y, z = directions.T
-        around = (0.1 + 0.9 * np.hypot(x, y)) ** 0.6
-        wide = 1 / (1 + np.exp((z + 0.3) / 0.13))
+        roundness = (0.1 + 0.9 * np.hypot(x, y)) ** 0.6
+        width = 1 / (1 + np.exp((z + 0.3) / 0.13))
         condyles = 27.0 * self.size**0.4 * (1.03 if self.sex == "m" else 1.0)
-        radius = 14.0 + (condyles - 14.0) * wide
-        points = np.stack([radius * x / around, 0.75 * radius * y / around + 5.0 * z**2, 45.0 * z], axis=1)
+        radius = 14.0 + (condyles - 14.0) * width
+        points = np.stack([radius * x / roundness, 0.75 * radius * y / roundness + 5.0 * z**2, 45.0 * z], axis=1)
         for place, push, narrow in (
             ((-0.55, -0.6, -0.6), (0.0, -14.0, -10.0), 9.0),
             ((0.6, -0.6, -0.5), (4.0, -7.0, -3.0), 9.0),
@@ -70,23 +70,23 @@ class Bone:
         ):
             points += near(directions, place, narrow) * np.array(push)
         rng = np.random.default_rng(0)
-        for place, much in zip(rng.standard_normal((_PLACES, 3)), self.varies, strict=True):
-            points += much * near(directions, place, 6.0) * directions
+        for place, amount in zip(rng.standard_normal((_PLACES, 3)), self.varies, strict=True):
+            points += amount * near(directions, place, 6.0) * directions
         if self.group == "bump":
             points += HIGH * near(directions, BUMP, 40.0) * np.array(BUMP)
         return np.asarray(self.size * points)
 
 
 def near(directions: Float[Floats, "N 3"], place: Sequence[float] | Floats, narrow: float) -> Float[Floats, "N 1"]:
-    """1 at a place on the sphere, less further away."""
-    toward = np.asarray(place) / np.linalg.norm(place)
-    return np.asarray(np.exp(narrow * (directions @ toward - 1.0))[:, None])
+    """Bump function on the sphere: 1 in the direction ``place``, decaying around it; larger ``narrow`` decays faster."""
+    direction = np.asarray(place) / np.linalg.norm(place)
+    return np.asarray(np.exp(narrow * (directions @ direction - 1.0))[:, None])
 
 
 @dataclass(frozen=True, eq=False)
 class Scanned:
-    """A bone as a scanner has it: its surface in triangles of its own, and the ``frame`` from there to where it stands;
-    ``directions`` say which place each vertex is.
+    """A scanned bone: its own triangulation, the ``frame`` from the scan's to the bone's coordinates, and the direction of
+    every vertex, which is the ground truth.
     """
 
     bone: Bone
@@ -95,12 +95,12 @@ class Scanned:
     directions: Float[Floats, "V 3"]
 
     def places(self, directions: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-        """Where places are, in the coordinates of the shape."""
+        """Points in the given directions, in the coordinates of the scan."""
         return self.frame.undo(self.bone.points(directions))
 
 
 def draw_bones(count: int, seed: int = 0) -> list[Bone]:
-    """As many bones; every third is a left one, every second has a bump, and half are of either sex."""
+    """Draw ``count`` random bones; every third one is a left one, every second one has a bump, and half are of each sex."""
     rng = np.random.default_rng([seed, 0])
     bones = []
     for k in range(count):
@@ -113,14 +113,14 @@ def draw_bones(count: int, seed: int = 0) -> list[Bone]:
 
 
 def scan(bone: Bone, vertices: int, seed: int = 0) -> Scanned:
-    """A bone, turned and moved at random, with about so many vertices; another seed has other triangles."""
+    """Scan a bone at a random position and orientation; the seed determines these and the triangulation."""
     rng = np.random.default_rng([seed, 1])
     number = np.arange(vertices) + 0.5
     z = 1.0 - 2.0 * number / vertices
-    turn = np.pi * (1 + np.sqrt(5)) * number
-    around = np.sqrt(1.0 - z**2)
-    spread = np.stack([around * np.cos(turn), around * np.sin(turn), z], axis=1)
-    directions = Rotation.random(rng=rng).apply(spread)
+    angle = np.pi * (1 + np.sqrt(5)) * number
+    ring_radius = np.sqrt(1.0 - z**2)
+    lattice = np.stack([ring_radius * np.cos(angle), ring_radius * np.sin(angle), z], axis=1)
+    directions = Rotation.random(rng=rng).apply(lattice)
     faces = outward(directions, ConvexHull(directions).simplices.astype(np.int64))
     mirror = np.diag([-1.0, 1.0, 1.0]) if bone.side == "left" else np.eye(3)
     frame = Frame(1.0, mirror @ Rotation.random(rng=rng).as_matrix(), rng.uniform(-100, 100, 3))
@@ -129,14 +129,14 @@ def scan(bone: Bone, vertices: int, seed: int = 0) -> Scanned:
 
 
 def outward(directions: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:
-    """Triangles on the sphere, all turned outwards."""
+    """Orient the triangles of a sphere outwards."""
     a, b, c = (directions[faces[:, k]] for k in range(3))
     inside = (np.cross(b - a, c - a) * a).sum(axis=1) < 0
     return np.where(inside[:, None], faces[:, ::-1], faces)
 
 
 def write_bones(folder: Path, scans: Sequence[Scanned]) -> None:
-    """``scans/NAME.ply``; ``landmarks/NAME.csv``, the true ones of each; and ``table.csv``, what is known of them."""
+    """Write ``scans/NAME.ply``, ``landmarks/NAME.csv`` with the true landmarks, and ``table.csv`` with the metadata."""
     make_folder(folder / "scans")
     make_folder(folder / "landmarks")
     directions = np.array(list(LANDMARKS.values()))
@@ -145,8 +145,8 @@ def write_bones(folder: Path, scans: Sequence[Scanned]) -> None:
         save_shape(folder / "scans" / f"{each.bone.name}.ply", each.shape)
         places = zip(LANDMARKS, each.places(directions).round(4).tolist(), strict=True)
         _write(folder / "landmarks" / f"{each.bone.name}.csv", [("name", "x", "y", "z"), *((n, *p) for n, p in places)])
-    known = ("name", "sex", "age", "group", "side")
-    _write(folder / "table.csv", [known, *([getattr(each.bone, column) for column in known] for each in scans)])
+    columns = ("name", "sex", "age", "group", "side")
+    _write(folder / "table.csv", [columns, *([getattr(each.bone, column) for column in columns] for each in scans)])
 
 
 def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
@@ -156,12 +156,12 @@ def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
 
 @runner.command
 def main(
-    folder: Annotated[Path, Argument(help="a folder, for scans, landmarks and table.csv")],
-    count: Annotated[int, Option(min=1, help="how many bones")] = 20,
-    vertices: Annotated[int, Option(min=100, help="of each, about")] = 3000,
+    folder: Annotated[Path, Argument(help="output folder, for scans, landmarks and table.csv")],
+    count: Annotated[int, Option(min=1, help="number of bones")] = 20,
+    vertices: Annotated[int, Option(min=100, help="approximate number of vertices of each")] = 3000,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    """Write bones that look like the lower ends of femurs, and their truth."""
+    """Write bones similar to the lower ends of femurs, with true landmarks."""
     bones = draw_bones(count, seed)
     rng = np.random.default_rng([seed, 2])
     scans = [scan(bone, int(vertices * rng.uniform(0.7, 1.3)), seed + k) for k, bone in enumerate(bones)]

@@ -1,7 +1,7 @@
-"""Generated people with known truth: in clothes, or naked and touching themselves.
+"""Generated people with ground-truth correspondence: clothed, or naked in poses of self-contact.
 
-They are made of people and poses that no training drew. A body is cut into other triangles, so that its vertices are
-nobody's; the truth is the place on the naked body below.
+Their identities and poses differ from those of all trainings. Bodies are remeshed, so that their vertices do not coincide
+with the template's; the ground truth is the place on the naked body below the clothes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from meshmatch.experiments.makers.contact_poses import POSES, contact_poses
 from meshmatch.experiments.makers.fused_surface import fused_surface
 from meshmatch.experiments.makers.other_triangles import other_triangles
 from meshmatch.generators.bodies import draw_identities, template_rig
-from meshmatch.generators.characters import Cast, sample_layers
+from meshmatch.generators.characters import CharacterConfig, sample_layers
 from meshmatch.generators.figure import Figure
 from meshmatch.generators.proportions import CHILD, SHARES, draw_style, stretched
 from meshmatch.geometry.trees import cKDTree
@@ -25,15 +25,13 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
 TRAINED_SEED = 0
-_FACES = 18_000  # of a body as it is seen
-_NORMAL = (
-    0.02  # metres that a vertex may be nearer and yet not be the place of one whose normal is a radian from its own
-)
+_FACES = 18_000  # number of faces of a shape, approximately
+_NORMAL_WEIGHT = 0.02  # distance in metres that counts as much as a unit difference of normals
 
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A shape; of every vertex the bone that it hangs on, the vertex of the body below, and that body."""
+    """A shape, with the body part of each vertex (``bones``) and its corresponding vertex of the naked ``body`` (``places``)."""
 
     shape: Shape
     bones: Int[Ints, " V"]
@@ -42,26 +40,30 @@ class Character:
 
 
 def people(template: Template, count: int, kind: int, seed: int = 0, tag: str = "") -> list[Character]:
-    """People in clothes, of a kind of `meshmatch.generators.proportions`: of 64 that no training of an included model drew,
-    on a human template's vertices."""
+    """Clothed people with one of the styles of `meshmatch.generators.proportions`.
+
+    They are drawn from 64 identities that no training of a bundled model used.
+    """
     figure = Figure.of(template_rig(template, 64, TRAINED_SEED + 1 + seed))
-    cast = Cast(figure, 1.0, kinds=tuple(float(each == kind) for each in range(len(SHARES))))
+    config = CharacterConfig(figure, 1.0, style_shares=tuple(float(each == kind) for each in range(len(SHARES))))
     generator = torch.Generator().manual_seed(7919 * (seed + 1) + kind)
     faces, share = figure.rig.faces.numpy(), figure.share.double().numpy()
     weights, fine = other_triangles(faces, len(share))
     bones = (weights @ share).argmax(1)
-    found = []
-    for k, (clothed, naked) in enumerate(zip(*sample_layers(cast, count, generator), strict=True)):
-        seen, below = (weights @ layer.double().numpy() for layer in (clothed, naked))
-        shape = decimate(Shape(seen, fine, f"{tag}{k}"), _FACES + 1000 * (k % 3))
-        places = cKDTree(seen).query(shape.verts)[1]
-        found.append(Character(shape, bones[places], Shape(below, fine, f"body {k}"), places))
-    return found
+    characters = []
+    for k, (clothed, naked) in enumerate(zip(*sample_layers(config, count, generator), strict=True)):
+        outer, inner = (weights @ layer.double().numpy() for layer in (clothed, naked))
+        shape = decimate(Shape(outer, fine, f"{tag}{k}"), _FACES + 1000 * (k % 3))
+        places = cKDTree(outer).query(shape.verts)[1]
+        characters.append(Character(shape, bones[places], Shape(inner, fine, f"body {k}"), places))
+    return characters
 
 
 def touching(template: Template, count: int, seed: int = 0, tag: str = "", fused: bool = False) -> list[Character]:
-    """Naked people, every second one a child, in the poses of `contact_poses.POSES`, one after the other; they too are of
-    64 that no training drew. ``fused``: the surface around them, in which parts that touch are one.
+    """Naked people, every second one a child, in the poses of `contact_poses.POSES` in order.
+
+    They are drawn from 64 identities that no training used. With ``fused``, shapes are the outer surfaces of the bodies, in
+    which touching parts are merged.
     """
     figure = Figure.of(template_rig(template, 64, TRAINED_SEED + 1 + seed))
     generator = torch.Generator().manual_seed(7919 * (seed + 1) + len(SHARES))
@@ -73,22 +75,23 @@ def touching(template: Template, count: int, seed: int = 0, tag: str = "", fused
     posed = contact_poses(figure, rest, heads, names, seed).double().numpy()
     weights, fine = other_triangles(figure.rig.faces.numpy(), posed.shape[1])
     bones = (weights @ figure.share.double().numpy()).argmax(1)
-    found = []
+    characters = []
     for k, naked in enumerate(posed):
         body = Shape(weights @ naked, fine, f"body {k}")
         shape = fused_surface(body) if fused else body
         shape = replace(decimate(shape, _FACES + 1000 * (k % 3)), name=f"{tag}{k}")
         places = places_on(body, shape)
-        found.append(Character(shape, bones[places], body, places))
-    return found
+        characters.append(Character(shape, bones[places], body, places))
+    return characters
 
 
 def places_on(body: Shape, shape: Shape) -> Int[Ints, " V"]:
-    """Of every vertex of a shape that lies on a body the nearest vertex of the body, among those whose normals are like its
-    own: where two parts touch, the place is on the right one.
+    """For each vertex of a shape on a body's surface, the nearest vertex of the body by position and normal.
+
+    Normals select the right part where two parts touch.
     """
 
-    def known(each: Shape) -> Float[Floats, "V 6"]:
-        return np.hstack([each.verts, _NORMAL * each.vertex_normals])
+    def features(each: Shape) -> Float[Floats, "V 6"]:
+        return np.hstack([each.verts, _NORMAL_WEIGHT * each.vertex_normals])
 
-    return np.asarray(cKDTree(known(body)).query(known(shape))[1])
+    return np.asarray(cKDTree(features(body)).query(features(shape))[1])

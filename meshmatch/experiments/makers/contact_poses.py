@@ -1,7 +1,7 @@
-"""Poses in which a body touches itself: sitting with crossed legs, hands on face, knees, shins or the other arm.
+"""Poses with self-contact: sitting with crossed legs, hands on face, knees, shins or the other arm.
 
-A pose begins with clinical angles set by hand. They are then moved, within their limits, until points of the skin that are
-to touch lie on each other, and parts run into each other no deeper than soft skin gives way.
+A pose starts from clinical angles set by hand. They are then optimised, within their limits, until given points of the skin
+touch, and body parts do not penetrate deeper than soft skin yields.
 """
 
 from __future__ import annotations
@@ -22,18 +22,22 @@ from meshmatch.generators.rotations import DEGREE
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_normals
 
-_STEPS, _EVERY, _RATE = 240, 6, 2.5  # of the descent: steps, steps between two searches for contacts, degrees a step
-_APART = 0.15  # metres between two points of the resting skin that are no neighbours
-_NEIGHBOURS = 40  # among which the nearest point that is no neighbour is looked for
-_REACH = 0.06  # metres: what is farther inside has come in from another side
-_TOUCHES = 0.015  # metres between vertices of parts that touch
-_GIVES = 0.004  # metres that skin gives way
-_TOUCH, _SOFT, _STAY = 100.0, 300.0, 2e-5  # weights: of square metres, and of square degrees from where a pose began
+_STEPS, _EVERY, _RATE = 240, 6, 2.5  # Adam: steps, steps between two searches for contacts, rate in degrees
+_MIN_REST_DISTANCE = 0.15  # metres: points of the skin that are farther apart at rest are not neighbors
+_N_NEAREST = 40  # nearest vertices that are searched for one that is not a neighbor
+_MAX_DEPTH = 0.06  # metres: points that are deeper inside came in from another side
+_TOUCH_DISTANCE = 0.015  # metres between vertices of touching parts
+_SKIN_YIELD = 0.004  # metres of penetration that are not penalised
+_TOUCH, _SOFT, _STAY = (
+    100.0,
+    300.0,
+    2e-5,
+)  # weights of contact and penetration (square metres), deviation (square degrees)
 _HAND = 0.03  # metres from the palm to the back of a hand
 _SPINE = {"spine05": 0.15, "spine04": 0.25, "spine03": 0.2, "spine02": 0.2, "spine01": 0.2}
 _NECK = {"neck01": 0.3, "neck02": 0.2, "neck03": 0.2, "head": 0.3}
 
-# Degrees (of the curl: hundredths), and how far they may go.
+# Limits of the angles in degrees (of the curl in hundredths).
 _LIMITS = {
     "arm_elevation": (3, 175), "arm_azimuth": (-60, 140), "arm_twist": (-130, 90), "elbow": (0, 150),
     "pronation": (-90, 95), "hip_flexion": (-40, 135), "hip_abduction": (-25, 65), "hip_twist": (-50, 75),
@@ -53,8 +57,7 @@ Angles = Mapping[str, float]
 
 @dataclass(frozen=True)
 class ContactPose:
-    """Angles to begin with, of the left and the right side (what is not named is 0), and of the trunk; the points of the
-    skin that touch."""
+    """Initial angles of the left side, right side and trunk (0 if not given), and the pairs of skin points that touch."""
 
     left: Angles
     right: Angles
@@ -108,53 +111,56 @@ POSES = {
 def contact_poses(
     figure: Figure, rest: Float[Tensor, "B V 3"], heads: Float[Tensor, "B J 3"], names: Sequence[str], seed: int
 ) -> Float[Tensor, "B V 3"]:
-    """Resting bodies, each in a pose of `POSES` that is a little different with every seed; metres, y up, facing +z."""
+    """Pose bodies, each by a pose of `POSES` with variations that depend on the seed; metres, y up, facing +z."""
     rig, poses = figure.rig, [POSES[name] for name in names]
     low, high = torch.tensor([*_LIMITS.values(), *_LIMITS.values(), *_TRUNK_LIMITS.values()]).T
-    start = torch.tensor([_angles_of(each) for each in poses])
+    start = torch.tensor([_angles(each) for each in poses])
     start += 5 * torch.randn(start.shape, generator=torch.Generator().manual_seed(seed))
     angles = start.clamp(low, high).requires_grad_()
-    row, one, two, above = _goals(poses, skin_points(figure))
-    descent = torch.optim.Adam([angles], _RATE)
-    schedule = torch.optim.lr_scheduler.LambdaLR(descent, lambda step: 1 - 0.9 * step / _STEPS)
+    row, first, second, above = _contacts(poses, skin_points(figure))
+    optimiser = torch.optim.Adam([angles], _RATE)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 1 - 0.9 * step / _STEPS)
     for step in range(_STEPS):
         verts = skin(rig, rest, *posed(rig, heads, angles, seed))
         if step % _EVERY == 0:
             normals = _normals(verts.detach(), rig.faces)
-            at, near, far = _near_contacts(verts.detach(), rest)
-        apart = verts[row, one] - verts[row, two] - above[:, None] * normals[row, two]
-        depth = ((verts[at, far] - verts[at, near]) * normals[at, far]).sum(-1)
-        loss = _TOUCH * apart.square().sum() + _SOFT * (depth - _GIVES).clamp_min(0).square().sum()
-        descent.zero_grad()
+            body_index, inner, outer = _near_contacts(verts.detach(), rest)
+        contact_gap = verts[row, first] - verts[row, second] - above[:, None] * normals[row, second]
+        depth = ((verts[body_index, outer] - verts[body_index, inner]) * normals[body_index, outer]).sum(-1)
+        loss = _TOUCH * contact_gap.square().sum() + _SOFT * (depth - _SKIN_YIELD).clamp_min(0).square().sum()
+        optimiser.zero_grad()
         (loss + _STAY * (angles - start).square().sum()).backward()
-        descent.step()
+        optimiser.step()
         schedule.step()
         with torch.no_grad():
             angles.clamp_(low, high)
     return skin(rig, rest, *posed(rig, heads, angles.detach(), seed))
 
 
-def _angles_of(pose: ContactPose) -> list[float]:
+def _angles(pose: ContactPose) -> list[float]:
     sides = [float(side.get(name, 0)) for side in (pose.left, pose.right) for name in _LIMITS]
     return [*sides, *(float(pose.trunk.get(name, 0)) for name in _TRUNK_LIMITS)]
 
 
-def _goals(poses: Sequence[ContactPose], points: Mapping[str, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows of poses, two vertices of each, and how far above the second one the first one is to be."""
-    goals = []
+def _contacts(poses: Sequence[ContactPose], points: Mapping[str, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Contacts of all poses: index of the body, two vertices, and the height of the first one above the second."""
+    contacts = []
     for row, each in enumerate(poses):
         for a, b in each.touching:
-            goals.append((row, points[a], points[b], 0.0))
-            if a.startswith("palm"):  # a hand lies flat if its back is right above
-                goals.append((row, points[a.replace("palm", "back")], points[b], _HAND))
-    rows, ones, twos, above = (torch.tensor(column) for column in zip(*goals, strict=True))
-    return rows, ones, twos, above
+            contacts.append((row, points[a], points[b], 0.0))
+            if a.startswith("palm"):  # the hand is flat if its back is straight above
+                contacts.append((row, points[a.replace("palm", "back")], points[b], _HAND))
+    rows, firsts, seconds, above = (torch.tensor(column) for column in zip(*contacts, strict=True))
+    return rows, firsts, seconds, above
 
 
 def _near_contacts(verts: Float[Tensor, "B V 3"], rest: Float[Tensor, "B V 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Bodies, vertices, and the far neighbours of these."""
-    found = [far_neighbours(_array(own), _array(asleep)) for own, asleep in zip(verts, rest, strict=True)]
-    index = torch.from_numpy(np.stack(found))
+    """Indices of bodies and vertices with `far_neighbours`, and these neighbors."""
+    neighbours = [
+        far_neighbours(_array(posed_verts), _array(rest_verts))
+        for posed_verts, rest_verts in zip(verts, rest, strict=True)
+    ]
+    index = torch.from_numpy(np.stack(neighbours))
     at, near = torch.nonzero(index >= 0).T
     return at, near, index[at, near]
 
@@ -162,7 +168,7 @@ def _near_contacts(verts: Float[Tensor, "B V 3"], rest: Float[Tensor, "B V 3"]) 
 def posed(
     rig: Rig, heads: Float[Tensor, "B J 3"], angles: Float[Tensor, "B A"], seed: int
 ) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
-    """World rotations and offsets of joints by angles in the order of the limits; what is drawn beside them has a seed."""
+    """World rotations and offsets of joints from angles in the order of the limits; ``seed`` is for all other joints."""
     n = len(_LIMITS)
     sides = [dict(zip(_LIMITS, side.unbind(1), strict=True)) for side in (angles[:, :n], angles[:, n : 2 * n])]
     left, right = (
@@ -173,19 +179,19 @@ def posed(
     draw = Draw(len(angles), torch.Generator().manual_seed(seed))
     matrices = pose_limbs(vectors, rig, heads, left, right, draw)
     for side, suffix in zip(sides, (".L", ".R"), strict=True):
-        turn = torch.stack([side[f"wrist_{axis}"] for axis in "xyz"], -1)
-        vectors[:, rig.joint("wrist" + suffix)] += DEGREE * turn
-    for shares, own in ((_SPINE, angles[:, 2 * n : 2 * n + 3]), (_NECK, angles[:, 2 * n + 3 :])):
+        wrist_angles = torch.stack([side[f"wrist_{axis}"] for axis in "xyz"], -1)
+        vectors[:, rig.joint("wrist" + suffix)] += DEGREE * wrist_angles
+    for shares, trunk_angles in ((_SPINE, angles[:, 2 * n : 2 * n + 3]), (_NECK, angles[:, 2 * n + 3 :])):
         for name, share in shares.items():
-            vectors[:, rig.joint(name)] = share * DEGREE * own
+            vectors[:, rig.joint(name)] = share * DEGREE * trunk_angles
     return forward_kinematics(rig, heads, joint_rotations(vectors, matrices))
 
 
 def far_neighbours(verts: Float[Floats, "V 3"], rest: Float[Floats, "V 3"]) -> Int[Ints, " V"]:
-    """Of every vertex the nearest one that is far from it along the body, -1 where none is within reach."""
-    away, near = cKDTree(verts).query(verts, _NEIGHBOURS, distance_upper_bound=_REACH)
-    near[~np.isfinite(away)] = 0
-    far = np.isfinite(away) & (np.linalg.norm(rest[near] - rest[:, None], axis=-1) > _APART)
+    """For each vertex the nearest vertex that is far away on the body at rest; -1 if there is none within `_MAX_DEPTH`."""
+    distance, near = cKDTree(verts).query(verts, _N_NEAREST, distance_upper_bound=_MAX_DEPTH)
+    near[~np.isfinite(distance)] = 0
+    far = np.isfinite(distance) & (np.linalg.norm(rest[near] - rest[:, None], axis=-1) > _MIN_REST_DISTANCE)
     first = far.argmax(1)
     return np.where(far.any(1), near[np.arange(len(verts)), first], -1)
 
@@ -193,12 +199,13 @@ def far_neighbours(verts: Float[Floats, "V 3"], rest: Float[Floats, "V 3"]) -> I
 def contact_depths(
     verts: Float[Floats, "V 3"], rest: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
 ) -> tuple[Bool[Bools, " V"], Float[Floats, " V"]]:
-    """Which vertices touch a part of the body that is far from them, to the distance of neighbours; and how deep each lies
-    in one, metres."""
-    other = far_neighbours(verts, rest)
-    away = np.where(other[:, None] >= 0, verts[other] - verts, np.inf)
-    depth = np.where(other >= 0, (np.nan_to_num(away, posinf=0.0) * vertex_normals(verts, faces)[other]).sum(1), 0.0)
-    return np.linalg.norm(away, axis=1) < _TOUCHES, depth.clip(0)
+    """Whether each vertex touches a distant part of the body, and its depth inside one, in metres."""
+    neighbour = far_neighbours(verts, rest)
+    offset = np.where(neighbour[:, None] >= 0, verts[neighbour] - verts, np.inf)
+    depth = np.where(
+        neighbour >= 0, (np.nan_to_num(offset, posinf=0.0) * vertex_normals(verts, faces)[neighbour]).sum(1), 0.0
+    )
+    return np.linalg.norm(offset, axis=1) < _TOUCH_DISTANCE, depth.clip(0)
 
 
 def _array(values: Tensor) -> Floats:
@@ -210,7 +217,7 @@ def _normals(verts: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -> Float[
 
 
 def skin_points(figure: Figure) -> dict[str, int]:
-    """Vertices of points of the skin, by their names, from the mean body."""
+    """Vertex indices of named points of the skin, determined on the mean body."""
     rig = figure.rig
     rest, heads = rig.rest.float().mean(0), rig.heads.mean(0)
     ahead, up = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.0, 1.0, 0.0])
@@ -218,7 +225,7 @@ def skin_points(figure: Figure) -> dict[str, int]:
     def joint(name: str) -> Tensor:
         return heads[rig.joint(name)]
 
-    found: dict[str, tuple[int, Tensor]] = {}
+    targets: dict[str, tuple[int, Tensor]] = {}
     for side, sign in (("L", 1.0), ("R", -1.0)):
         out = sign * torch.tensor([1.0, 0.0, 0.0])
         finger = [joint(f"finger3-{k}.{side}") for k in (1, 2, 3)]
@@ -226,7 +233,7 @@ def skin_points(figure: Figure) -> dict[str, int]:
         curled = torch.nn.functional.normalize(torch.linalg.cross(torch.linalg.cross(a, b), a), dim=0)
         shoulder, elbow, wrist = (joint(f"{name}.{side}") for name in ("upperarm01", "lowerarm01", "wrist"))
         hip, knee, ankle = (joint(f"{name}.{side}") for name in ("upperleg01", "lowerleg01", "foot"))
-        found |= {
+        targets |= {
             f"palm {side}": (part("hand", side), finger[0] + 0.05 * curled),
             f"back {side}": (part("hand", side), finger[0] - 0.05 * curled),
             f"cheek {side}": (part("head"), joint(f"eye.{side}") - 0.05 * up + 0.05 * ahead + 0.02 * out),
@@ -244,6 +251,6 @@ def skin_points(figure: Figure) -> dict[str, int]:
         }
     owner = figure.share.argmax(1)
     return {
-        name: int(torch.where(owner == of, (rest - place).norm(dim=1), torch.inf).argmin())
-        for name, (of, place) in found.items()
+        name: int(torch.where(owner == part_index, (rest - position).norm(dim=1), torch.inf).argmin())
+        for name, (part_index, position) in targets.items()
     }

