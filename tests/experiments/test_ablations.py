@@ -13,21 +13,29 @@ from meshmatch.experiments.bench.sets import load_set
 from meshmatch.experiments.paper import ablation_errors, ablation_training, ablations, blends
 from meshmatch.experiments.paper.ablation_errors import (
     Measure,
-    begin,
+    build_subject,
     chosen_names,
     pair_errors,
+    predict_start,
     refinement_of,
-    subject,
 )
 from meshmatch.experiments.paper.ablation_results import (
     Sample,
+    bodies_interval,
+    check_increase,
     claims_table,
     difference,
-    over_bodies,
-    over_shapes,
-    rising,
+    shapes_interval,
 )
-from meshmatch.experiments.paper.ablation_training import SCANS, Setting, fewer, new_network, pool_of, timed, train_run
+from meshmatch.experiments.paper.ablation_training import (
+    SCANS,
+    Setting,
+    keep_first_points,
+    new_network,
+    pool_of,
+    time_iterations,
+    train_run,
+)
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, TABLE3, VIEWS, Run, all_runs
 from meshmatch.experiments.runner import words_of
 from meshmatch.fields.shape_functions import FIELDS
@@ -183,11 +191,11 @@ def test_fewer_supervised_points_are_regularised_everywhere(setting: Setting) ->
     drawn = pool_of(setting, "T", 2)
     network = new_network(BASE, setting, drawn)
     points = build_loss_points(setting.template(BASE), "smooth", network)
-    few = fewer(points, 50)
+    few = keep_first_points(points, 50)
     vectors = torch.randn(2, 300, 3, generator=torch.Generator().manual_seed(0)) * 0.1
     assert torch.allclose(few.moved(vectors), points.moved(vectors)[:, :50], atol=1e-6)
     assert torch.equal(few.field.deformation_gradient(vectors), points.field.deformation_gradient(vectors))
-    assert fewer(points, 1000) is points
+    assert keep_first_points(points, 1000) is points
 
 
 @pytest.mark.slow
@@ -215,12 +223,12 @@ def test_a_template_of_heavy_people_stands_as_the_usual_one() -> None:
     ],
 )
 def test_a_claim_needs_an_interval_beside_zero(errors: tuple[list[float], ...], verdict: str) -> None:
-    assert rising("held out", "rising", [Sample(each) for each in errors]).verdict == verdict
+    assert check_increase("held out", "rising", [Sample(each) for each in errors]).verdict == verdict
 
 
 def test_a_claim_that_nobody_measured_has_no_row() -> None:
     there = Sample([1.0, 1.1]), Sample([2.0, 2.1])
-    found = [rising("held out", "a < b", there), rising("scape", "b < c", [Sample([]), Sample([])])]
+    found = [check_increase("held out", "a < b", there), check_increase("scape", "b < c", [Sample([]), Sample([])])]
     assert words_of(claims_table(found)) == (
         ["claim", "held out", "scape"],
         [["a < b", "supported (0.70 to 1.30)", ""]],
@@ -239,7 +247,7 @@ def test_pairs_must_carry_an_order_too() -> None:
     clear, even = [1.0] * 4, [0.0, 0.0, 2.2, 2.2]
     for bodies, verdict in (([1.1] * 4, "supported"), (even, "not testable here")):
         samples = Sample([1.0, 1.01], [clear, clear]), Sample([1.1, 1.11], [bodies, bodies])
-        assert rising("scape", "rising", samples).verdict == verdict
+        assert check_increase("scape", "rising", samples).verdict == verdict
 
 
 def test_pairs_of_a_shape_are_no_independent_witnesses() -> None:
@@ -247,16 +255,16 @@ def test_pairs_of_a_shape_are_no_independent_witnesses() -> None:
     off = np.full((12, 12), -0.02)
     off[3], off[:, 3] = 2.0, 2.0
     off = off[~np.eye(12, dtype=bool)]
-    low, high = over_shapes(off, 12)
-    assert low < 0 < over_bodies(off)[0] and high > over_bodies(off)[1]
-    assert over_shapes(np.arange(6.0), 3)[0] >= 0 and over_shapes(np.full(6, 0.5), 3) == [0.5, 0.5]
+    low, high = shapes_interval(off, 12)
+    assert low < 0 < bodies_interval(off)[0] and high > bodies_interval(off)[1]
+    assert shapes_interval(np.arange(6.0), 3)[0] >= 0 and shapes_interval(np.full(6, 0.5), 3) == [0.5, 0.5]
 
 
 def subjects_of(small: Path, name: str, cache: Path, measure: Measure = QUICK):
     bench = load_set(name, small)
     names = chosen_names(bench, measure)
     frames = [sqrt_area_frame(bench.shape(each)) for each in names]
-    return bench, [subject(bench, each, frame, measure, cache) for each, frame in zip(names, frames, strict=True)]
+    return bench, [build_subject(bench, each, frame, measure, cache) for each, frame in zip(names, frames, strict=True)]
 
 
 def test_a_template_that_lies_on_the_shapes_makes_no_error(small: Path, tmp_path: Path) -> None:
@@ -319,7 +327,7 @@ def test_a_shape_is_begun_in_the_frame_of_the_reference(small: Path, tmp_path: P
     _, (one, *_) = subjects_of(small, "faust", tmp_path)
     turn = Frame(2.0, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([1.0, 2, 3]))
     other = replace(one, frame=turn.compose(one.frame))
-    here, there = (begin(model, each, folder, QUICK) for each in (one, other))
+    here, there = (predict_start(model, each, folder, QUICK) for each in (one, other))
     assert np.allclose(here.candidate.vectors, there.candidate.vectors)
     laid = [start.frame.undo(node_system(model).moved(start.candidate.vectors)) for start in (here, there)]
     assert np.allclose(turn.apply(laid[1]), laid[0])
@@ -376,7 +384,7 @@ def test_the_command_goes_on(
 
 
 def test_cells_take_turns(setting: Setting) -> None:
-    found = timed(setting, [replace(BASE, field=field) for field in FIELDS], 2)
+    found = time_iterations(setting, [replace(BASE, field=field) for field in FIELDS], 2)
     assert set(found) == {"base", "field-rbf", "field-pointwise"}
     assert all(record["rounds"] == 2 and record["ms"] > 0 and record["cpu_ms"] > 0 for record in found.values())
 

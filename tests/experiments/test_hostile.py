@@ -16,9 +16,9 @@ from meshmatch.experiments.hostile import campaign as hostile
 from meshmatch.experiments.hostile import inputs as hostile_inputs
 from meshmatch.experiments.hostile import kills as hostile_kills
 from meshmatch.experiments.hostile import readers as hostile_readers
-from meshmatch.experiments.hostile.damage import damaged
+from meshmatch.experiments.hostile.damage import apply_damage
 from meshmatch.experiments.hostile.inputs import Sample, make_input, run_batch
-from meshmatch.experiments.hostile.learned import sign
+from meshmatch.experiments.hostile.learned import update_hashes
 from meshmatch.experiments.hostile.samples import make_samples
 from meshmatch.models.registry import verify_model
 from meshmatch.templates.template import load_template
@@ -58,7 +58,7 @@ def test_a_number_gives_the_same_file_again(samples: list[Sample], tmp_path: Pat
 
 def test_what_is_nested_deeply_is_damaged_otherwise() -> None:
     deep = b'{"a":' * 600 + b"1" + b"}" * 600
-    assert len({damaged(deep, deep, np.random.default_rng(seed)) for seed in range(1000)}) > 800
+    assert len({apply_damage(deep, deep, np.random.default_rng(seed)) for seed in range(1000)}) > 800
 
 
 def crash(path: Path) -> None:
@@ -151,7 +151,7 @@ def test_what_somebody_signs_is_read(samples: list[Sample], tmp_path: Path) -> N
         (folder / f"{name}.safetensors").write_bytes(data)
         with pytest.raises(ModelError, match=r"not those of its card|does not match its hash"):
             verify_model(folder)
-        sign(folder)
+        update_hashes(folder)
         if name == "weights":
             assert verify_model(folder).name == "model"
         else:

@@ -386,7 +386,7 @@ class Spoilt(CorrespondenceLoss):
 @pytest.mark.parametrize(("how", "error", "words"), [
     (lambda terms: terms["total"], OptionError, "a dictionary of scalar tensors"),
     (lambda terms: {**terms, "mine": 1.0}, OptionError, "a dictionary of scalar tensors"),
-    (lambda terms: {**terms, "mine": terms["total"].expand(3)}, OptionError, "each of one number"),
+    (lambda terms: {**terms, "mine": terms["total"].expand(3)}, OptionError, "scalar tensors"),
     (lambda terms: {"mine": terms["total"]}, OptionError, "'total'"),
     (lambda terms: {"total": terms["total"].detach()}, OptionError, "gradient"),
     (lambda terms: {**terms, "total": terms["total"] / 0}, ModelError, "not finite at step 1 are total"),

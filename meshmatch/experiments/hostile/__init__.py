@@ -1,1 +1,1 @@
-"""Damaged files and killed commands."""
+"""Robustness tests: damaged files and killed commands."""

@@ -1,4 +1,4 @@
-"""Ways to damage a file: its bytes, its words and numbers, and what lies inside JSON, zip archives and headers."""
+"""Ways to damage a file: its bytes, words and numbers, and the contents of JSON, zip archives and headers."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ _NUMBER = re.compile(rb"-?\d+\.?\d*(?:e[+-]?\d+)?")
 _WORD = re.compile(rb"[^\s,;\"]+")
 
 
-def damaged(data: bytes, other: bytes, rng: np.random.Generator) -> bytes:
-    """The bytes after one to three damages; `other` are those of another file of the family."""
+def apply_damage(data: bytes, other: bytes, rng: np.random.Generator) -> bytes:
+    """Apply one to three random damages to a file's bytes; `other` are those of another file of the family."""
     for _ in range(int(rng.integers(1, 4))):
         if rng.random() < 0.05:
             cut, resume = rng.integers(len(data) + 1), rng.integers(len(other) + 1)
@@ -63,52 +63,52 @@ def damaged(data: bytes, other: bytes, rng: np.random.Generator) -> bytes:
     return data
 
 
-def _place(data: bytes, rng: np.random.Generator) -> int:
-    """Somewhere; half of the time near the beginning, where headers are."""
-    most = len(data) + 1
-    return int(rng.integers(min(most, 600) if rng.random() < 0.5 else most))
+def _position(data: bytes, rng: np.random.Generator) -> int:
+    """Random position; half of the time near the beginning, where headers are."""
+    limit = len(data) + 1
+    return int(rng.integers(min(limit, 600) if rng.random() < 0.5 else limit))
 
 
 def _flip(data: bytes, rng: np.random.Generator) -> bytes:
     changed = bytearray(data)
     for _ in range(int(rng.integers(1, 9))):
-        at = _place(data, rng)
+        at = _position(data, rng)
         if at < len(changed):
             changed[at] ^= 1 << int(rng.integers(8)) if rng.random() < 0.5 else int(rng.integers(1, 256))
     return bytes(changed)
 
 
 def _cut(data: bytes, rng: np.random.Generator) -> bytes:
-    return data[: _place(data, rng)]
+    return data[: _position(data, rng)]
 
 
 def _remove(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
+    at = _position(data, rng)
     return data[:at] + data[at + int(rng.integers(1, 200)) :]
 
 
 def _repeat(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
+    at = _position(data, rng)
     end = at + int(rng.integers(1, 200))
     return data[:end] + data[at:end] * int(rng.choice([1, 2, 50, 2000])) + data[end:]
 
 
 def _insert(data: bytes, rng: np.random.Generator) -> bytes:
-    at = _place(data, rng)
+    at = _position(data, rng)
     return data[:at] + rng.bytes(int(rng.integers(1, 50))) + data[at:]
 
 
 def _integer(data: bytes, rng: np.random.Generator) -> bytes:
     kind = str(rng.choice(["<u2", "<u4", "<u8", ">u4", "u1"]))
     number = NUMBERS[int(rng.integers(len(NUMBERS)))] % (1 << 8 * np.dtype(kind).itemsize)
-    at = _place(data, rng) // (1 if rng.random() < 0.5 else 4) * (1 if rng.random() < 0.5 else 4)
+    at = _position(data, rng) // (1 if rng.random() < 0.5 else 4) * (1 if rng.random() < 0.5 else 4)
     written = np.array(number, kind).tobytes()
     return data[:at] + written + data[at + len(written) :]
 
 
-def _number_of(pattern: re.Pattern[bytes]) -> Damage:
+def _replace_match(pattern: re.Pattern[bytes]) -> Damage:
     def change(data: bytes, rng: np.random.Generator) -> bytes:
-        found = pattern.search(data, _place(data, rng))
+        found = pattern.search(data, _position(data, rng))
         if found is None:
             return _flip(data, rng)
         return data[: found.start()] + WORDS[int(rng.integers(len(WORDS)))] + data[found.end() :]
@@ -117,29 +117,29 @@ def _number_of(pattern: re.Pattern[bytes]) -> Damage:
 
 
 def _line(data: bytes, rng: np.random.Generator) -> bytes:
-    """A line is left out, doubled, moved, or repeated many times."""
+    """Remove, duplicate, move or repeat a line."""
     lines = data.split(b"\n")
-    at, to = (int(rng.integers(len(lines))) for _ in range(2))
-    one = lines.pop(at)
+    at, target = (int(rng.integers(len(lines))) for _ in range(2))
+    line = lines.pop(at)
     for _ in range(int(rng.choice([0, 1, 2, 3000]))):
-        lines.insert(to, one)
-        if len(one) > 1000:
+        lines.insert(target, line)
+        if len(line) > 1000:
             break
     return b"\n".join(lines)
 
 
-def _added(data: bytes, rng: np.random.Generator) -> bytes:
-    """A line of some format or habit is put between two others."""
-    at = data.find(b"\n", _place(data, rng)) + 1
+def _insert_line(data: bytes, rng: np.random.Generator) -> bytes:
+    """Insert a line that is typical of some format or program."""
+    at = data.find(b"\n", _position(data, rng)) + 1
     return data[:at] + LINES[int(rng.integers(len(LINES)))] + b"\n" + data[at:]
 
 
-def _habit(data: bytes, rng: np.random.Generator) -> bytes:
-    """The text as another program or country would write it."""
-    return _HABITS[int(rng.integers(len(_HABITS)))](data)
+def _change_conventions(data: bytes, rng: np.random.Generator) -> bytes:
+    """Rewrite the text in the conventions of another program or locale."""
+    return _CONVENTIONS[int(rng.integers(len(_CONVENTIONS)))](data)
 
 
-_HABITS: tuple[Callable[[bytes], bytes], ...] = (
+_CONVENTIONS: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: b"\xef\xbb\xbf" + data,
     lambda data: data.decode("latin-1").encode("utf-16"),
     lambda data: b"\xfe\xff" + data.decode("latin-1").encode("utf-16-be"),
@@ -156,12 +156,24 @@ _HABITS: tuple[Callable[[bytes], bytes], ...] = (
     bytes.swapcase,
 )
 WAYS: list[Damage] = [
-    *(_flip, _cut, _remove, _repeat, _insert, _integer, _number_of(_NUMBER), _number_of(_WORD), _line, _added, _habit)
+    *(
+        _flip,
+        _cut,
+        _remove,
+        _repeat,
+        _insert,
+        _integer,
+        _replace_match(_NUMBER),
+        _replace_match(_WORD),
+        _line,
+        _insert_line,
+        _change_conventions,
+    )
 ]
 
 
 def _json(data: bytes, rng: np.random.Generator) -> bytes:
-    """A value somewhere in the JSON of a file, of a glb or of a safetensors header becomes another one, or goes."""
+    """Change or remove a value in the JSON of a file, of a glb or of a safetensors header."""
     for part in (lambda whole: (whole, bytes), _glb, _tensors):
         try:
             text, put_back = part(data)
@@ -170,13 +182,13 @@ def _json(data: bytes, rng: np.random.Generator) -> bytes:
             continue
         if isinstance(found, dict | list) and found:
             try:
-                return put_back(json.dumps(_changed(found, rng)).encode("utf-8", "surrogatepass"))
-            except RecursionError:  # it was nested twice
+                return put_back(json.dumps(_change_value(found, rng)).encode("utf-8", "surrogatepass"))
+            except RecursionError:  # nested more than once
                 break
     return _flip(data, rng)
 
 
-def _changed(found: Any, rng: np.random.Generator) -> Any:
+def _change_value(found: Any, rng: np.random.Generator) -> Any:
     inner = found
     while True:
         keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
@@ -218,25 +230,28 @@ def _tensors(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
 
 
 def _archive(data: bytes, rng: np.random.Generator) -> bytes:
-    """A member of a zip archive is damaged, and packed again with the right checksum; or all of them are zeros."""
+    """Damage a member of a zip archive, or fill it with zeros, and pack it again with the right checksum."""
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            held = [(name, archive.read(name)) for name in archive.namelist()]
-    except Exception:  # no archive, or damaged already
+            members = [(name, archive.read(name)) for name in archive.namelist()]
+    except Exception:  # not an archive, or already damaged
         return _flip(data, rng)
-    chosen = int(rng.integers(max(len(held), 1)))
+    chosen = int(rng.integers(max(len(members), 1)))
     out = BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for number, (name, content) in enumerate(held):
+        for number, (name, content) in enumerate(members):
             if number == chosen:
-                zeros, way = rng.random() < 0.05, _header if rng.random() < 0.6 else WAYS[int(rng.integers(len(WAYS)))]
-                content = bytes(3_000_000) if zeros else way(content, rng)
+                zeros, change = (
+                    rng.random() < 0.05,
+                    _header if rng.random() < 0.6 else WAYS[int(rng.integers(len(WAYS)))],
+                )
+                content = bytes(3_000_000) if zeros else change(content, rng)
             archive.writestr(name, content)
     return out.getvalue()
 
 
 def _header(data: bytes, rng: np.random.Generator) -> bytes:
-    """Another shape or kind of numbers in the header of an npy array."""
+    """Change the shape or dtype in the header of an npy array."""
     end = data.find(b"\n")
     if data[:6] != b"\x93NUMPY" or not 10 < end < 1000:
         return _flip(data, rng)

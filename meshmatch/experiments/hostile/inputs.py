@@ -1,4 +1,4 @@
-"""Damaged files read one after the other, in a process that may not take more time or memory than the product promises."""
+"""Read damaged files one after the other, in a process with limits on time and memory."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from typing import IO
 import numpy as np
 
 from meshmatch.errors import LONGEST, MeshmatchError, MeshmatchWarning, visible
-from meshmatch.experiments.hostile.damage import damaged
-from meshmatch.experiments.hostile.learned import sign, trainers
+from meshmatch.experiments.hostile.damage import apply_damage
+from meshmatch.experiments.hostile.learned import trainers, update_hashes
 from meshmatch.experiments.hostile.readers import BadMessage, readers
 from meshmatch.experiments.hostile.samples import Sample, small_shape
 from meshmatch.shapes.shape import Shape
 
 KINDS = ("traceback", "crash", "time", "memory", "printed", "message")
-"""What can fail: another exception than ours, the end of the process, more than `SECONDS` of the processor, more memory than
-four times the file and a gigabyte, something printed that is no message, a message that is long or commands a terminal."""
+"""Kinds of failure: an exception other than meshmatch's, a crash of the process, more than `SECONDS` of CPU time, more
+memory than allowed, output that is not a message, a message that is too long or contains terminal escapes."""
 SECONDS = 20.0
-BATCH = 200  # inputs of one process
-# With hashes that whoever damages a file on purpose would write too.
+BATCH = 200  # inputs per process
+# Files with hashes, which an attacker would adapt to the damage.
 _SIGNED = ("models", "implicit models", "templates")
 _NAMES: tuple[Callable[[str], str], ...] = (
     *(str.swapcase, str.upper, lambda name: name.replace(" ", "%20"), lambda name: f"textures\\{name}"),
     *(partial(unicodedata.normalize, form) for form in ("NFC", "NFD")),
-)  # what a file beside another may be called on its way through other systems
-_PATIENCE = 300.0  # seconds by the clock, for what sleeps, or hears no signal
-_ROOM = 1 << 30
+)  # changes that other systems make to the names of accompanying files
+_PATIENCE = 300.0  # seconds of wall time, against readers that sleep or ignore the signal
+_MEMORY_LIMIT = 1 << 30  # bytes, in addition to the memory of the process at its start
 
 
 @dataclass(frozen=True)
 class Failure:
-    """One input that went wrong."""
+    """A failed input."""
 
     number: int
     family: str
@@ -56,25 +56,25 @@ class Failure:
 _shape = cache(small_shape)
 
 
-class _Late(BaseException):
-    """The time is over; no `except Exception` may swallow it."""
+class _TimeLimitExceeded(BaseException):
+    """The time limit was exceeded; not an `Exception`, so that readers do not catch it."""
 
 
 def make_input(samples: Sequence[Sample], seed: int, number: int, folder: Path) -> tuple[Sample, Path]:
-    """Put a damaged sample into a folder; the same for the same seed and number. Families take turns."""
+    """Write a damaged sample into a folder, determined by seed and number; families alternate."""
     rng = np.random.default_rng([seed, number])
     families = list(dict.fromkeys(sample.family for sample in samples))
     family = families[number % len(families)]
-    ours = [sample for sample in samples if sample.family == family]
-    sample, other = (ours[int(rng.integers(len(ours)))] for _ in range(2))
+    family_samples = [sample for sample in samples if sample.family == family]
+    sample, other = (family_samples[int(rng.integers(len(family_samples)))] for _ in range(2))
     for name in sample.files:
         (folder / name).parent.mkdir(exist_ok=True)
         shutil.copyfile(sample.folder / name, folder / name)
     chosen = sample.files[0] if rng.random() < 0.8 else sample.files[int(rng.integers(len(sample.files)))]
     data = (sample.folder / chosen).read_bytes()
-    (folder / chosen).write_bytes(damaged(data, (other.folder / other.files[0]).read_bytes(), rng))
+    (folder / chosen).write_bytes(apply_damage(data, (other.folder / other.files[0]).read_bytes(), rng))
     if family in _SIGNED and rng.random() < 0.5:
-        sign(folder)
+        update_hashes(folder)
     if family == "shapes" and len(sample.files) > 1 and rng.random() < 0.3:
         other_name = str(rng.choice(sample.files[1:]))
         rename = _NAMES[int(rng.integers(len(_NAMES)))]
@@ -83,13 +83,13 @@ def make_input(samples: Sequence[Sample], seed: int, number: int, folder: Path) 
 
 
 def judge(family: str, path: Path, shape: Shape, printed: IO[bytes]) -> tuple[str, str]:
-    """Kind and words of what goes wrong with an input; empty where nothing does."""
+    """Kind and description of the failure of an input; both are empty if there is none."""
     for read in readers(family, path, shape):
         kind, what = "", ""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always")
-                warnings.simplefilter("ignore", MeshmatchWarning)  # words for the user
+                warnings.simplefilter("ignore", MeshmatchWarning)  # meant for the user
                 read()
         except MeshmatchError as error:
             if "allocate" in error.message:
@@ -100,7 +100,7 @@ def judge(family: str, path: Path, shape: Shape, printed: IO[bytes]) -> tuple[st
             kind, what = "message", str(error)
         except MemoryError:
             kind, what = "memory", traceback.format_exc()
-        except _Late:
+        except _TimeLimitExceeded:
             kind, what = "time", traceback.format_exc()
         except Exception:
             kind, what = "traceback", traceback.format_exc()
@@ -114,80 +114,83 @@ def judge(family: str, path: Path, shape: Shape, printed: IO[bytes]) -> tuple[st
 
 
 def run_batch(samples: Sequence[Sample], seed: int, numbers: range, keep: Path) -> list[Failure]:
-    """Judge the inputs of some numbers; each failure is kept as a folder with the file and what it said."""
+    """Judge the inputs with the given numbers; each failure is kept in a folder, with the file and the output."""
     failures: list[Failure] = []
-    left = numbers
-    _shape(), trainers()  # once, for all processes forked from this one
-    while left:
-        ready, say = os.pipe()
+    remaining = numbers
+    _shape(), trainers()  # built once, before processes are forked
+    while remaining:
+        read_end, write_end = os.pipe()
         child = os.fork()
         if not child:
             status = 1
             try:
-                os.close(ready)
-                with os.fdopen(say, "w") as out:
-                    _work(samples, seed, left, out)
+                os.close(read_end)
+                with os.fdopen(write_end, "w") as out:
+                    _work(samples, seed, remaining, out)
                 status = 0
             finally:
-                os._exit(status)  # nothing of this process's is cleaned up by its copy
-        os.close(say)
-        at, found = _listen(ready, child, left.start)
+                os._exit(status)  # the forked copy must not run the cleanup of this process
+        os.close(write_end)
+        last, found = _listen(read_end, child, remaining.start)
         failures += found
-        left = range(at + 1, left.stop)
+        remaining = range(last + 1, remaining.stop)
     for failure in failures:
-        place = keep / f"{failure.kind}-{failure.family}-{failure.number}"
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir(parents=True)
-        make_input(samples, seed, failure.number, place)
-        (place / "what.txt").write_text(failure.what, encoding="utf-8", errors="replace")
+        target = keep / f"{failure.kind}-{failure.family}-{failure.number}"
+        shutil.rmtree(target, ignore_errors=True)
+        target.mkdir(parents=True)
+        make_input(samples, seed, failure.number, target)
+        (target / "what.txt").write_text(failure.what, encoding="utf-8", errors="replace")
     return failures
 
 
-def _listen(ready: int, child: int, first: int) -> tuple[int, list[Failure]]:
-    """What a worker says of each number; a worker that ends early has failed at the number after its last."""
+def _listen(pipe: int, child: int, first: int) -> tuple[int, list[Failure]]:
+    """Collect a worker's reports; return the last number and the failures.
+
+    If the worker ends early, the number after its last report has failed.
+    """
     import select
 
-    found, at, family, text = [], first - 1, "", b""
-    late = False
+    failures, last, family, text = [], first - 1, "", b""
+    timed_out = False
     while True:
-        heard, _, _ = select.select([ready], [], [], _PATIENCE)
-        late = not heard
-        more = b"" if late else os.read(ready, 1 << 16)
-        if not more:
+        readable, _, _ = select.select([pipe], [], [], _PATIENCE)
+        timed_out = not readable
+        chunk = b"" if timed_out else os.read(pipe, 1 << 16)
+        if not chunk:
             break
-        text += more
+        text += chunk
         *lines, text = text.split(b"\n")
         for line in lines:
             record = json.loads(line)
             if "begun" in record:
                 family = record["begun"]
                 continue
-            at, family = record["number"], "unknown"
+            last, family = record["number"], "unknown"
             if record["kind"]:
-                found.append(Failure(**record))
-    if late:
+                failures.append(Failure(**record))
+    if timed_out:
         os.kill(child, signal.SIGKILL)
-    os.close(ready)
+    os.close(pipe)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if status or late:
-        at += 1
-        found.append(Failure(at, family, "time" if late else "crash", f"the process ended with {status}"))
-    return at, found
+    if status or timed_out:
+        last += 1
+        failures.append(Failure(last, family, "time" if timed_out else "crash", f"the process ended with {status}"))
+    return last, failures
 
 
 def _work(samples: Sequence[Sample], seed: int, numbers: range, out: IO[str]) -> None:
-    """In a process of its own: read, and say of each number what went wrong."""
+    """Worker process: read the inputs and report the result of each."""
 
-    def late(number: int, frame: object) -> None:
-        raise _Late
+    def on_alarm(number: int, frame: object) -> None:
+        raise _TimeLimitExceeded
 
-    signal.signal(signal.SIGPROF, late)
+    signal.signal(signal.SIGPROF, on_alarm)
     shape = _shape()
     with tempfile.TemporaryFile() as printed, tempfile.TemporaryDirectory() as place:
         os.dup2(printed.fileno(), 2)
         sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + _ROOM, used + _ROOM))
+        resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY_LIMIT, used + _MEMORY_LIMIT))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in numbers:
             folder = Path(place, str(number))
@@ -195,7 +198,7 @@ def _work(samples: Sequence[Sample], seed: int, numbers: range, out: IO[str]) ->
             sample, path = make_input(samples, seed, number, folder)
             print(json.dumps({"begun": sample.family}), file=out, flush=True)
             kind, what = "", ""
-            with suppress(_Late):
+            with suppress(_TimeLimitExceeded):
                 kind, what = "time", "it took too long, and swallowed the alarm"
                 signal.setitimer(signal.ITIMER_PROF, SECONDS)
                 try:

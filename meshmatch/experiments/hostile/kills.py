@@ -1,4 +1,6 @@
-"""Commands killed at random moments, or on a full disk: afterwards the old or the new is there, whole, and nothing else."""
+"""Kill commands at random moments, or run them on a full disk: afterwards the old or the new files must be there, complete,
+and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +43,11 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 @dataclass(frozen=True)
 class Case:
-    """A command in a folder of its own. Before each kill `reset` brings back the old. `outputs` are the files that are
-    looked at afterwards, and `states` what they may be: the old and the new; `apart` if each file appears by itself. Then a
-    command follows, `after`, which goes on with what was begun or clears up what was left. A run takes some `seconds`.
+    """A command to kill, in its own folder.
+
+    `reset` restores the old state before each kill. `outputs` returns the digests of the output files, and `states` are the
+    two allowed results: old and new. With `apart`, each file may be old or new independently. `after` is a command that
+    then continues the work or cleans up. `seconds` are durations of complete runs.
     """
 
     name: str
@@ -59,42 +63,42 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """fine, missed (it ended before) or broken."""
+    """Outcome of a kill: fine, missed (the command had finished before) or broken."""
 
     outcome: str
     what: str = ""
 
 
 def make_cases(folder: Path, training: bool) -> list[Case]:  # noqa: C901
-    """Cheap commands come more often in a turn. Each is run once to its end, to know what the new is."""
+    """Prepare all cases, fast commands several times; each command is run to its end, to record the new state."""
     shape = small_shape()
 
     def case(name: str, words: str, files: Files, outputs: Outputs, after: str = "", apart: bool = False) -> Case:
         place = folder / name.replace(" ", "-")
         place.mkdir(parents=True)
         files(place)
-        kept = folder / f"{place.name}-kept"
-        shutil.copytree(place, kept)
+        original = folder / f"{place.name}-kept"
+        shutil.copytree(place, original)
 
         def reset() -> None:
             shutil.rmtree(place)
-            shutil.copytree(kept, place)
+            shutil.copytree(original, place)
 
         def found() -> dict[str, str]:
-            held = {str(path.relative_to(place)): path for path in outputs(place) if path.is_file()}
-            return {name: digest(path) for name, path in held.items() if "/." not in f"/{name}"}
+            paths = {str(path.relative_to(place)): path for path in outputs(place) if path.is_file()}
+            return {name: digest(path) for name, path in paths.items() if "/." not in f"/{name}"}
 
-        one = Case(name, place, tuple(words.split()), reset, found, tuple(after.split()), apart=apart)
-        one.states.append(found())
-        for _ in range(2):  # the second run is as quick as those that are killed
+        new_case = Case(name, place, tuple(words.split()), reset, found, tuple(after.split()), apart=apart)
+        new_case.states.append(found())
+        for _ in range(2):  # the second run is as fast as those that are killed
             reset()
-            began = time.monotonic()
-            status = os.waitstatus_to_exitcode(os.waitpid(_start(one), 0)[1])
-            one.seconds.insert(0, time.monotonic() - began)
+            start = time.monotonic()
+            status = os.waitstatus_to_exitcode(os.waitpid(_start(new_case), 0)[1])
+            new_case.seconds.insert(0, time.monotonic() - start)
             if status:
                 raise MeshmatchError(f"{name} ended with {status} in {place}")
-        one.states.append(found())
-        return one
+        new_case.states.append(found())
+        return new_case
 
     def pair(place: Path) -> None:
         source, target = (bundled_folder() / "samples" / f"{name}.ply" for name in ("climber", "dancer"))
@@ -127,13 +131,13 @@ def make_cases(folder: Path, training: bool) -> list[Case]:  # noqa: C901
         return lambda place: sorted(path for part in parts for path in (place / part).rglob("*") if path.is_file())
 
     def trained(place: Path) -> list[Path]:
-        """The files of a model that has a card."""
+        """Files of the model, if it has a card."""
         if not any((place / "m" / card).exists() for card in ("card.json", IMPLICIT)):
             return []
         return [path for name in ("weights", "template") for path in (place / "m").glob(f"{name}.safetensors")]
 
     def prepared(place: Path) -> list[Path]:
-        """Without the picture, which is drawn last, for people."""
+        """All files but the picture, which is drawn last."""
         return [path for path in all_of("out")(place) if path.name != "nodes.png"]
 
     def ready(place: Path) -> None:
@@ -161,65 +165,67 @@ def make_cases(folder: Path, training: bool) -> list[Case]:  # noqa: C901
         long.append(case("train", learn, ready, trained, learn))
         implicit = "train --implicit --shapes in -o m --steps 3 -q"
         long.append(case("train --implicit", implicit, lambda place: write_eggs(place / "in"), trained, implicit))
-    return [one for last in long for one in (*[add, obj, mapping, add, mapping, add] * 2, last)]
+    return [new_case for last in long for new_case in (*[add, obj, mapping, add, mapping, add] * 2, last)]
 
 
 def kill(case: Case, seed: int, number: int) -> Outcome:
-    """Start a command and end it at a random moment; what is found then must be the old or the new."""
+    """Start a command and kill it at a random moment; the files must then be the old or the new ones."""
     rng = np.random.default_rng([seed, 1, number])
     case.reset()
     child = _start(case)
     time.sleep(float(rng.uniform(0.0, 1.0)) * case.seconds[0])
     sign = SIGNALS[int(rng.integers(len(SIGNALS)))]
     os.kill(child, sign)
-    began = time.monotonic()
-    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
-        if time.monotonic() - began > 30:
+    kill_time = time.monotonic()
+    while not (waited := os.waitpid(child, os.WNOHANG))[0]:
+        if time.monotonic() - kill_time > 30:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
             return Outcome("broken", f"{case.name} did not end within 30 s after {sign.name}")
         time.sleep(0.002)
-    status = os.waitstatus_to_exitcode(ended[1])
+    status = os.waitstatus_to_exitcode(waited[1])
     allowed = {0, -sign, 128 + sign}
-    hidden = [] if sign == signal.SIGKILL else _hidden(case)
-    _quietly(case.folder, ("models", "list"))  # what any next command does
+    hidden = [] if sign == signal.SIGKILL else _hidden_files(case)
+    _quietly(case.folder, ("models", "list"))  # any next command cleans up
     found = case.outputs()
     what = f"{case.name} after {sign.name}: status {status}, hidden {hidden}, found {found}, not {case.states}"
-    what += f"\n{_said(case).read_text(errors='replace')}"
-    case.seconds[0] *= 0.85 if status == 0 else 1.03  # most should be hit
+    what += f"\n{_output_file(case).read_text(errors='replace')}"
+    case.seconds[0] *= 0.85 if status == 0 else 1.03  # adapt, so that most commands are hit
     if status not in allowed or (hidden and not case.after) or not _old_or_new(case, found):
         return Outcome("broken", what)
     if case.after:
         _quietly(case.folder, case.after)
-        hidden = _hidden(case)
-        then = case.outputs()
-        if hidden or then != (case.states[1] if case.after == case.words else found):
-            return Outcome("broken", f"{what}; then {' '.join(case.after)} left hidden {hidden}, found {then}")
+        hidden = _hidden_files(case)
+        after_state = case.outputs()
+        if hidden or after_state != (case.states[1] if case.after == case.words else found):
+            return Outcome("broken", f"{what}; then {' '.join(case.after)} left hidden {hidden}, found {after_state}")
     return Outcome("missed" if status == 0 else "fine")
 
 
 def fill(case: Case, seed: int, number: int) -> Outcome:
-    """Run a command where no file may be larger than a random size, as on a full disk; it must say so in words."""
+    """Run a command with a random limit on the size of files, as on a full disk; it must report a proper error."""
     rng = np.random.default_rng([seed, 2, number])
     case.reset()
     largest = max(path.stat().st_size for path in case.folder.rglob("*") if path.is_file())
     limit = int(rng.integers(1000, max(2000, largest)))
     status = os.waitstatus_to_exitcode(os.waitpid(_start(case, limit), 0)[1])
-    said, found = _said(case).read_text(errors="replace"), case.outputs()
-    what = f"{case.name} with {limit} bytes a file: status {status}, hidden {_hidden(case)}, found {found}\n{said}"
-    told = said.startswith("error: cannot write") and said.count("\n") <= 2
-    if not (status == 0 or (status == 1 and told)) or _hidden(case) or not _old_or_new(case, found):
+    output, found = _output_file(case).read_text(errors="replace"), case.outputs()
+    what = (
+        f"{case.name} with {limit} bytes a file: status {status}, hidden {_hidden_files(case)}, found {found}\n{output}"
+    )
+    is_proper_error = output.startswith("error: cannot write") and output.count("\n") <= 2
+    if not (status == 0 or (status == 1 and is_proper_error)) or _hidden_files(case) or not _old_or_new(case, found):
         return Outcome("broken", what)
     return Outcome("missed" if status == 0 else "fine")
 
 
-def _hidden(case: Case) -> list[str]:
-    """What is left half-written; a lock is not."""
+def _hidden_files(case: Case) -> list[str]:
+    """Names of hidden files, which are incomplete output; except the lock."""
     return [path.name for path in case.folder.rglob(".*") if path.name != LOCK]
 
 
 def _old_or_new(case: Case, found: dict[str, str]) -> bool:
-    """Each file the old or the new; where the name of a folder is taken, all of it the same."""
+    """Whether the files are the old or the new ones; all of the same state, unless the case has `apart`."""
     if found in case.states:
         return True
     old, new = case.states
@@ -227,15 +233,15 @@ def _old_or_new(case: Case, found: dict[str, str]) -> bool:
 
 
 def _start(case: Case, limit: int | None = None) -> int:
-    """The command in a process forked from this one, where all is imported; maybe with a limit on the size of files."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS[1:])  # none may unwind the copy of what called this
+    """Start the command in a forked process, where all is imported, optionally with a limit on the size of files."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS[1:])  # no signal may unwind the caller's stack in the forked copy
     child = os.fork()
     if child:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS[1:])
         return child
     status = 99
     try:
-        with open(_said(case), "wb") as said:
+        with open(_output_file(case), "wb") as said:
             os.dup2(said.fileno(), 1)
             os.dup2(said.fileno(), 2)
         for sign in SIGNALS[1:]:
@@ -245,14 +251,14 @@ def _start(case: Case, limit: int | None = None) -> int:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
         status = _run(case.folder, case.words)
     except KeyboardInterrupt:
-        status = 130  # before the command begins
+        status = 130  # interrupted before the command started
     except BaseException:
         traceback.print_exc()
     finally:
         os._exit(status)
 
 
-def _said(case: Case) -> Path:
+def _output_file(case: Case) -> Path:
     return case.folder.with_suffix(".said")
 
 
@@ -262,7 +268,7 @@ def _quietly(place: Path, words: tuple[str, ...]) -> None:
 
 
 def _run(place: Path, words: tuple[str, ...]) -> int:
-    """A command in a folder, with a registry and a cache of its own."""
+    """Run a command in a folder, with a separate registry and cache."""
     os.environ |= {HOME_VARIABLE: str(place / "home"), "XDG_CACHE_HOME": str(place / "cache")}
     before = os.getcwd()
     os.chdir(place)
@@ -274,9 +280,9 @@ def _run(place: Path, words: tuple[str, ...]) -> int:
 
 
 def digest(path: Path) -> str:
-    """Of what a file says."""
+    """Hash of a file's content."""
     data = path.read_bytes()
-    if path.suffix == ".safetensors":  # its writer shuffles the words in the header
+    if path.suffix == ".safetensors":  # the order of keys in the header is random
         size = 8 + int.from_bytes(data[:8], "little")
         data = json.dumps(json.loads(data[8:size]), sort_keys=True).encode() + data[size:]
     return hashlib.sha256(data).hexdigest()[:16]

@@ -1,6 +1,6 @@
-"""Samples of what is learned from shapes, for `experiments.hostile`: fits, atlases, prepared folders, models, checkpoints.
+"""Samples of fits, atlases, prepared folders, models and checkpoints, for `experiments.hostile`.
 
-All of it is made of three eggs in seconds, so that the files are small.
+All of them are made from three eggs in seconds, so that the files are small.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ RECIPE = Recipe(
     ScanConfig(points=96, noise=0.012, outliers=0, partial=0),
     "smooth",
 )
-"""A network that is trained in a second."""
+"""Recipe of a network that trains in a second."""
 IMPLICIT_TRAINING = replace(TRAINING, steps=2, shapes=2, warm_up=1)
 _KINDS = {"F64": "<f8", "F32": "<f4", "I32": "<i4", "I64": "<i8"}
 _IMPLICIT_NETWORK = ImplicitConfig("mls", code=8, width=24, depth=2, inner=8, nodes=20)
 
 
 def write_eggs(folder: Path, count: int = 3, splits: int = 3) -> None:
-    """Eggs that share their triangles, an icosahedron's split so often."""
+    """Write eggs with the same triangles: an icosahedron subdivided ``splits`` times."""
     folder.mkdir(parents=True)
     ball, rng = icosphere(splits), np.random.default_rng(8)
     for number in range(count):
@@ -64,13 +64,13 @@ def write_eggs(folder: Path, count: int = 3, splits: int = 3) -> None:
 
 
 def prepare_eggs(eggs: Path, output: Path) -> None:
-    """Make them ready to learn from."""
+    """Write the prepared folder of a folder of eggs."""
     prepare(eggs, output, PrepareConfig(NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)))
 
 
 @cache
 def trainers() -> tuple[Trainer, Trainer]:
-    """What reads the checkpoints of both kinds."""
+    """Trainers that read the checkpoints of explicit and of implicit models."""
     with tempfile.TemporaryDirectory() as place:
         eggs, ready = Path(place, "eggs"), Path(place, "ready")
         write_eggs(eggs)
@@ -83,7 +83,7 @@ def trainers() -> tuple[Trainer, Trainer]:
 
 
 def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
-    """Family, folder and the file in it that is read, of everything that is learned."""
+    """Yield family, folder, and the file in it that is read."""
     eggs = folder / "eggs"
     write_eggs(eggs)
     collection = Collection(folder / "fits", workers=1)
@@ -118,10 +118,8 @@ def _remove(folder: Path, *names: str) -> None:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def sign(folder: Path) -> None:
-    """Write the hash of damaged weights on the card, and that of a damaged template into it, as somebody would who means
-    harm; nothing where they are too damaged for that.
-    """
+def update_hashes(folder: Path) -> None:
+    """Update the hashes of damaged weights and templates, as an attacker would; skip files that are too damaged."""
     for card in (folder / CARD, folder / IMPLICIT):
         try:
             words = json.loads(card.read_bytes())

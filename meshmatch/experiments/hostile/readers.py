@@ -1,4 +1,4 @@
-"""What reads a file of each family of `experiments.hostile`, and what it may say."""
+"""Functions that read the files of each family of `experiments.hostile`, and a check of their messages."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ _EGGS = Registered(
 
 
 def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], object]]:
-    """All that the product does with a file of a family while it is read."""
+    """Yield everything that meshmatch does when it reads a file of a family."""
     if family == "shapes":
-        yield lambda: _look_at(path)
-        yield lambda: _choose(path)
+        yield lambda: _load_all(path)
+        yield lambda: _select_parts(path)
         yield lambda: _write_again(path)
         if path.suffix in (".glb", ".gltf"):
             yield lambda: load_weights(path, load_shape(path))
@@ -70,8 +70,8 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
         "poses": (lambda: load_poses(path),),
         "samples": (lambda: samples_of(path, 64, np.random.default_rng(0)),),
         "fits": (lambda: Collection(path.parents[1], 1).atlas(poor=True), lambda: _map_all(path)),
-        "atlases": (lambda: _look_at_atlas(path),),
-        "prepared": tuple(partial(read, path.parent) for read in (_learn_from, is_registered, frame_of, has_sides)),
+        "atlases": (lambda: _use_atlas(path),),
+        "prepared": tuple(partial(read, path.parent) for read in (_draw_shapes, is_registered, frame_of, has_sides)),
         "checkpoints": (lambda: trainers()[path.stem == "chair"].load(path),),
         "models": (lambda: verify_model(path.parent),),
         "implicit models": (lambda: verify_model(path.parent), lambda: load_implicit(path.parent)),
@@ -88,18 +88,18 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
         yield lambda: _info(path)
 
 
-def _look_at(path: Path) -> None:
+def _load_all(path: Path) -> None:
     shape = load_shape(path)
     found = []
-    for look in (find_appearance, load_coordinates):
+    for load in (find_appearance, load_coordinates):
         try:
-            found.append(look(path, shape))
+            found.append(load(path, shape))
         except MeshmatchError as error:
             check(error.message, error.hint)
 
 
-def _choose(path: Path) -> None:
-    """Parts of a shape by number or name."""
+def _select_parts(path: Path) -> None:
+    """Select parts of a shape by number or name."""
     for only, without in (("1", ()), ((), ("2", "sto*")), (("body", "1"), "*")):
         try:
             load_shape(path, only=only, without=without)
@@ -109,12 +109,12 @@ def _choose(path: Path) -> None:
 
 
 def _write_again(path: Path) -> None:
-    """What is read can be written, and what was written can be read."""
+    """Write a shape in other formats and read it again."""
     shape = load_shape(path)
     for suffix in (".ply", ".glb") if shape.is_cloud else (".ply", ".obj", ".off", ".glb", ".stl"):
-        out = path.with_name(f"again{suffix}")
-        save_shape(out, shape)
-        again = load_shape(out)
+        copy = path.with_name(f"again{suffix}")
+        save_shape(copy, shape)
+        again = load_shape(copy)
         if suffix != ".stl" and (again.V, again.F) != (shape.V, shape.F):
             raise AssertionError(f"{suffix} has {again.V} vertices and {again.F} faces, not {shape.V} and {shape.F}")
 
@@ -126,22 +126,22 @@ def _map_all(path: Path) -> None:
     Collection(fits, 1).save_maps(fits / "maps")
 
 
-def _look_at_atlas(path: Path) -> None:
+def _use_atlas(path: Path) -> None:
     atlas = Atlas.load(path)
     atlas.sample(1)
     atlas.project(atlas.mean)
     check(*atlas.names)
 
 
-def _learn_from(folder: Path) -> None:
-    """Draw shapes of a prepared folder, as a training does."""
+def _draw_shapes(folder: Path) -> None:
+    """Draw shapes from a prepared folder, as in training."""
     template = load_template(folder / TEMPLATE)
     read_samples(folder, template)
     registered_source(torch.from_numpy(read_registered(folder, template)))(2, torch.Generator().manual_seed(0))
 
 
 def _info(path: Path) -> None:
-    """What the verb says is judged, and kept from where failures are looked for."""
+    """Run the command `info` and check its output, which is captured so that it does not count as stray output."""
     out = io.StringIO()
     with redirect_stdout(out):
         info(path, False)
@@ -149,7 +149,7 @@ def _info(path: Path) -> None:
 
 
 class BadMessage(Exception):
-    """Words that are too long, or that could command a terminal."""
+    """A message with a line break or terminal escapes."""
 
 
 def check(*lines: str) -> None:

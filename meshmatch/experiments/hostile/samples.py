@@ -1,4 +1,4 @@
-"""One good file of every kind that the product reads, for `experiments.hostile` to damage."""
+"""Valid files of every kind that meshmatch reads, for `experiments.hostile` to damage."""
 
 from __future__ import annotations
 
@@ -40,9 +40,7 @@ IMAGES = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP", "bmp": "BMP", "tga": "TGA
 
 @dataclass(frozen=True)
 class Sample:
-    """A folder with a file of a family, maybe among others and in folders of its own; the first of its files is the one
-    that is read, all may be damaged.
-    """
+    """A folder with files of a family, possibly in subfolders; the first one is read, all may be damaged."""
 
     family: str
     folder: Path
@@ -50,25 +48,25 @@ class Sample:
 
 
 def small_shape() -> Shape:
-    """A body of some hundred vertices, in colors."""
+    """A body of about a hundred vertices, with colors."""
     body = decimate(load_shape(bundled_folder() / "samples" / "climber.ply"), 200)
     colors = np.random.default_rng(0).random((body.V, 4))
     return Shape(body.verts, body.faces, "small.ply", colors)
 
 
 def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
-    """Write all samples, each into a folder of its own; the order is always the same."""
-    found: list[Sample] = []
+    """Write all samples, each into its own folder, in a fixed order."""
+    samples: list[Sample] = []
     shape = small_shape()
     colors = np.random.default_rng(7).random((shape.V, 4))
     cloud = Shape(shape.verts, np.empty((0, 3), np.int64), "cloud")
 
     def add(family: str, name: str, write: Callable[..., Any], *more: Any) -> None:
-        place = folder / f"{len(found):03d}-{family}"
-        place.mkdir(parents=True)
-        write(place / name, *more)
-        others = sorted(set(os.listdir(place)) - {name})
-        found.append(Sample(family, place, (name, *others)))
+        sample_folder = folder / f"{len(samples):03d}-{family}"
+        sample_folder.mkdir(parents=True)
+        write(sample_folder / name, *more)
+        others = sorted(set(os.listdir(sample_folder)) - {name})
+        samples.append(Sample(family, sample_folder, (name, *others)))
 
     for suffix in (".ply", ".obj", ".off", ".stl", ".glb", ".vtk", ".vtp"):
         add("shapes", f"a{suffix}", lambda path: save_shape(path, shape))
@@ -89,9 +87,9 @@ def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
         add("shapes", f"a{suffix}", lambda path: save_textured(path, Textured(shape.verts, shape.faces, uv), paint))
     index = np.arange(shape.V)[::-1].copy()
     trust = np.linspace(0, 1, shape.V)
-    about: dict[str, Any] = {"confidence": trust, "verdict": "fair", "reasons": ("it lies far",)}
+    metadata: dict[str, Any] = {"confidence": trust, "verdict": "fair", "reasons": ("it lies far",)}
     for suffix in MAP_SUFFIXES:
-        add("maps", f"m{suffix}", lambda path: save_map(path, VertexMap.between(shape, shape, index, **about)))
+        add("maps", f"m{suffix}", lambda path: save_map(path, VertexMap.between(shape, shape, index, **metadata)))
     values = Values(np.random.default_rng(2).random((shape.V, 3)), ("a", "b", "c"))
     for suffix in (".npy", ".csv"):
         add("tables", f"v{suffix}", lambda path: save_values(path, values, shape))
@@ -137,14 +135,14 @@ def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
     for storage in ("int8", "float16", "float32"):
         add("safetensors", "w.safetensors", lambda path, kind: save_network(state, path, storage=kind), storage)
     add("templates", "t.safetensors", lambda path: shutil.copyfile(built_in / "template.safetensors", path))
-    for family, place, name in learned_samples(folder / "learned"):
-        held = sorted(str(path.relative_to(place)) for path in place.rglob("*") if path.is_file())
-        found.append(Sample(family, place, (name, *(other for other in held if other != name))))
-    return found
+    for family, sample_folder, name in learned_samples(folder / "learned"):
+        files = sorted(str(path.relative_to(sample_folder)) for path in sample_folder.rglob("*") if path.is_file())
+        samples.append(Sample(family, sample_folder, (name, *(other for other in files if other != name))))
+    return samples
 
 
 def write_small_model(folder: Path) -> None:
-    """A copy of a model that ships."""
+    """Copy a bundled model."""
     built_in = bundled_folder() / "models" / "hand"
     shutil.copytree(built_in, folder)
     card = json.loads((built_in / "card.json").read_bytes()) | {"name": folder.name}
@@ -166,7 +164,7 @@ def _implicit() -> ImplicitCard:
 
 
 def _texts() -> dict[str, bytes]:
-    """What other programs write, and ours does not: text, big-endian, strips, polygons, colors and counts of many kinds."""
+    """Files as only other programs write them: text, big-endian, strips, polygons, unusual colors and counts."""
     places = np.random.default_rng(5).random((9, 3))
     rows = "".join(" ".join(f"{x:.4f}" for x in row) + "\n" for row in places)
     head = "ply\nformat {} 1.0\nelement vertex 9\nproperty float x\nproperty float y\nproperty float z\n"
@@ -176,7 +174,7 @@ def _texts() -> dict[str, bytes]:
     mixed = "3 0 1 2\n4 2 3 4 5\n5 4 5 6 7 8\n"
     swapped = head.format("binary_big_endian") + faces + "end_header\n"
     big = b"".join(bytes([3]) + np.array([k, k + 1, k + 2], ">i4").tobytes() for k in range(3))
-    corner = "0 0 0\n2 0 0\n2 2 0\n1 0.5 0\n0 2 0\n"  # of a polygon that turns back
+    corner = "0 0 0\n2 0 0\n2 2 0\n1 0.5 0\n0 2 0\n"  # corners of a concave polygon
     facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
     triangles = np.zeros(3, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     triangles["corners"] = places.reshape(3, 3, 3)
@@ -200,7 +198,7 @@ def _texts() -> dict[str, bytes]:
 
 
 def _write_scan(path: Path) -> None:
-    """As scanning programs write an obj: a path in a comment, opacity as Tr, names in another case."""
+    """Write an obj as scanning programs do: a path in a comment, opacity as Tr, names in another case."""
     path.with_name("Scan.MTL").write_text("# C:\\scan\\\nnewmtl skin\nTr 1\nd 1.0\nmap_Kd .\\K\u00f6 rper.PNG\n")
     path.with_name("k\u00f6 rper.png").write_bytes(_image(np.zeros((2, 2, 4), np.uint8), "PNG"))
     path.write_text(
@@ -210,7 +208,7 @@ def _write_scan(path: Path) -> None:
 
 
 def _write_textured_ply(path: Path, wedges: bool) -> None:
-    """A square with coordinates of corners or of vertices."""
+    """Write a square with texture coordinates of corners or of vertices."""
     path.with_name("a b.png").write_bytes(_image(np.zeros((2, 2, 4), np.uint8), "PNG"))
     own = "" if wedges else "property float s\nproperty float t\n"
     more = "property list uchar float texcoord\nproperty int texnumber\n" if wedges else ""
@@ -234,7 +232,7 @@ def _write_poses(path: Path) -> None:
 
 
 def _write_apart(path: Path) -> None:
-    """A gltf whose buffer and image are files beside it."""
+    """Write a gltf whose buffer and image are separate files."""
     words = _skinned()
     for part, name in ((words["buffers"][0], "apart.bin"), (words["images"][0], "apart.png")):
         path.with_name(name).write_bytes(base64.b64decode(part["uri"].partition("base64,")[2]))
@@ -243,7 +241,7 @@ def _write_apart(path: Path) -> None:
 
 
 def _skinned() -> dict[str, Any]:
-    """A square with two joints, a texture, and a mesh that stands far away, is instanced, and is hidden."""
+    """A square with two joints and a texture, and a second mesh that is far away, instanced, and hidden."""
     parts = [
         np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4"), np.array([0, 1, 2, 1, 3, 2], "<u2"),
         np.array([[0, 1, 0, 0]] * 4, "<u2"), np.array([[0.75, 0.25, 0, 0]] * 4, "<f4"), np.ones((4, 3), "<f4"),

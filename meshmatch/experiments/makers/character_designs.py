@@ -31,7 +31,7 @@ _NORMAL_WEIGHT = 0.02  # distance in metres that counts as much as a unit differ
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A shape, with the body part of each vertex (``bones``) and its corresponding vertex of the naked ``body`` (``places``)."""
+    """A shape; its vertices have a body part (``bones``) and a corresponding vertex (``places``) of the naked ``body``."""
 
     shape: Shape
     bones: Int[Ints, " V"]

@@ -1,1 +1,1 @@
-"""The paper's tables and figures, and the other methods that they compare with."""
+"""Reproduction of the paper's tables and figures, and of the methods that they compare with."""

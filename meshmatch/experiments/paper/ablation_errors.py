@@ -1,7 +1,6 @@
-"""How well an ablation run matches: pairs of a benchmark's set after different refinements.
+"""Geodesic errors of an ablation run on pairs of a benchmark set, after different refinements.
 
-The orientation of every shape is given, the same to all runs: that of the fit of one model (--model). What is compared is
-what the runs do from there.
+The orientation of every shape is given and the same for all runs: that of the fit of one model (--model).
 """
 
 from __future__ import annotations
@@ -36,19 +35,19 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 
 METHODS = ("none", "code", "chamfer")
-"""Refinements: none; of the code with the run's regularisers, or without."""
+"""Refinements: none; of the latent code with the run's regularisers; of the code by the Chamfer distance alone."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """How errors are measured.
+    """Settings of the evaluation.
 
     Parameters
     ----------
-    shapes : of each set, evenly spread; all ordered pairs of them are measured
-    landmarks : of each pair, evenly spread
-    code_steps, code_rate, code_points : of the search over codes and its Chamfer distance
-    samples : of a shape's surface
+    shapes : number of shapes of each set, evenly spread; all their ordered pairs are evaluated
+    landmarks : number of landmarks of each pair, evenly spread
+    code_steps, code_rate, code_points : settings of the search over codes and of its Chamfer distance
+    samples : number of samples of a shape's surface
     """
 
     shapes: int = 6
@@ -62,15 +61,15 @@ class Measure:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A shape of a set, seen from the core frame of the model that said its orientation.
+    """A shape of a set, with the core frame that the reference model found.
 
     Parameters
     ----------
-    frame : that frame
-    scan : samples in it
+    frame : the core frame
+    scan : surface samples in the core frame
     marks : landmarks in the file's frame
-    tree : of all vertices in the file's frame
-    distances : from the landmarks along the surface, in units of sqrt(area)
+    tree : k-d tree of all vertices in the file's frame
+    distances : geodesic distances from the landmarks, in units of sqrt(area)
     """
 
     name: str
@@ -81,20 +80,20 @@ class Subject:
     distances: Float[np.ndarray, "N V"]
 
 
-def oriented(shape: Shape, model: str, measure: Measure) -> Frame:
-    """From the file to the core frame that a model finds."""
+def find_core_frame(shape: Shape, model: str, measure: Measure) -> Frame:
+    """Find the core frame of a shape by fitting a model."""
     config = FitConfig(seed=measure.seed, partial="no")
     return Fitter(as_model(model), config).fit(validated(shape).shape).frame
 
 
 def chosen_names(bench: BenchSet, measure: Measure) -> list[str]:
-    """Shapes of a set, evenly spread over those that are the target of some pair."""
+    """Names of the evaluated shapes: evenly spread over those that are the target of some pair."""
     targets = {target for _, target in bench.pairs}
     return spread([name for name in bench.shapes if name in targets], measure.shapes)
 
 
-def subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: Path | None) -> Subject:
-    """A shape whose core frame is known, sampled, with its landmarks and the distances from them."""
+def build_subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: Path | None) -> Subject:
+    """Sample a shape with a known core frame, and compute the distances from its landmarks."""
     shape, landmarks = bench.seen(name), bench.landmarks(name)
     chosen = np.array(spread(range(len(landmarks)), measure.landmarks))
     distances = TruthDistances(bench.shape(name), landmarks[chosen], cache).of(np.arange(len(chosen)))
@@ -105,7 +104,7 @@ def subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: P
 
 
 def refinement_of(run: Run, method: str, measure: Measure) -> LatentRefineConfig | None:
-    """What a method does: the paper's weights at test time, without those of constraints that a run does not have."""
+    """Settings of a method: the paper's weights at test time, or zero for the constraints that a run does not have."""
     if method == "none":
         return None
     latent = LatentRefineConfig(steps=measure.code_steps, rate=measure.code_rate, points=measure.code_points)
@@ -116,7 +115,7 @@ def refinement_of(run: Run, method: str, measure: Measure) -> LatentRefineConfig
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The network's own answer on a shape: the way into the run's core frame, samples there, rows of the field."""
+    """The network's prediction for a shape: the frame of its core, samples in it, and the predicted node vectors."""
 
     frame: Frame
     scan: OrientedPoints
@@ -124,39 +123,41 @@ class Start:
 
 
 def in_core_frame(template: Template, one: Subject, reference: str) -> tuple[Frame, OrientedPoints]:
-    """A subject, whose frame is that of the ``reference`` model, in the core frame of a template."""
-    theirs, turn = as_model(reference).template, Frame.identity()
-    if theirs.shape.V == template.shape.V and np.array_equal(theirs.core, template.core):
-        turn = kabsch(template.shape.verts[template.core], theirs.shape.verts[theirs.core]).frame
-    return one.frame.compose(turn), one.scan.in_frame(turn)
+    """Transform a subject from the core frame of the ``reference`` model to that of a template."""
+    reference_template, frame = as_model(reference).template, Frame.identity()
+    if reference_template.shape.V == template.shape.V and np.array_equal(reference_template.core, template.core):
+        frame = kabsch(
+            template.shape.verts[template.core], reference_template.shape.verts[reference_template.core]
+        ).frame
+    return one.frame.compose(frame), one.scan.in_frame(frame)
 
 
-def begin(model: TrainedModel, one: Subject, reference: str, measure: Measure) -> Start:
-    """The network's answer on a subject, whose frame is that of the ``reference`` model."""
+def predict_start(model: TrainedModel, one: Subject, reference: str, measure: Measure) -> Start:
+    """Predict the fit of a subject, whose frame is that of the ``reference`` model."""
     frame, scan = in_core_frame(model.template, one, reference)
     rng = np.random.default_rng(measure.seed)
-    found = Predictor.of(model, rng).fit(scan, RigidPose.identity())
-    return Start(frame.compose(found.pose.frame), scan.to_local(found.pose), found)
+    candidate = Predictor.of(model, rng).fit(scan, RigidPose.identity())
+    return Start(frame.compose(candidate.pose.frame), scan.to_local(candidate.pose), candidate)
 
 
 def errors_of(
     model: TrainedModel, run: Run, subjects: Sequence[Subject], reference: str, method: str, measure: Measure
 ) -> dict[str, Any]:
-    """Mean and median geodesic error in cm over all landmarks of all ordered pairs, CPU seconds of refining a shape.
+    """Mean and median geodesic error in cm over all landmarks of all ordered pairs, and CPU seconds to refine a shape.
 
-    Maps are the paper's: the nearest vertex of one fitted template, the same vertex of the other, the nearest vertex of
-    the target.
+    Maps are those of the paper: to the nearest vertex of the fitted template, the same vertex of the other fitted template,
+    and the nearest vertex of the target.
     """
-    starts = [begin(model, one, reference, measure) for one in subjects]
-    how = refinement_of(run, method, measure)
-    began = time.process_time()
+    starts = [predict_start(model, one, reference, measure) for one in subjects]
+    config = refinement_of(run, method, measure)
+    start_time = time.process_time()
     rows = [start.candidate.vectors for start in starts]
-    if how is not None:
+    if config is not None:
         rows = [
-            refine_code(model, start.scan, how, np.random.default_rng(measure.seed), start=each)
+            refine_code(model, start.scan, config, np.random.default_rng(measure.seed), start=each)
             for start, each in zip(starts, rows, strict=True)
         ]
-    seconds = (time.process_time() - began) / len(subjects)
+    seconds = (time.process_time() - start_time) / len(subjects)
     fitted = [start.frame.undo(node_system(model).moved(each)) for start, each in zip(starts, rows, strict=True)]
     errors = pair_errors(subjects, fitted)
     return {
@@ -165,16 +166,16 @@ def errors_of(
         "share_over_15cm": round(float((errors > LOST_CM).mean()), 4),
         "pair_cm": errors.mean(1).round(3).tolist(),
         "seconds": round(seconds, 4),
-        "how": None if how is None else asdict(how),
+        "how": None if config is None else asdict(config),
     }
 
 
 def pair_errors(subjects: Sequence[Subject], fitted: Sequence[Float[Floats, "V 3"]]) -> Float[Floats, "pairs N"]:
-    """Errors in cm of the maps through templates that were fitted to shapes, in their files' frames."""
+    """Errors in cm, for all ordered pairs and landmarks, of the maps through fitted templates (in their files' frames)."""
     errors = []
     nearest = [cKDTree(points).query(one.marks)[1] for one, points in zip(subjects, fitted, strict=True)]
     for source, target in permutations(range(len(subjects)), 2):
-        there = subjects[target].tree.query(fitted[target][nearest[source]])[1]
-        along = subjects[target].distances[np.arange(len(there)), there]
-        errors.append(along.astype(np.float64) * CM_PER_UNIT)
+        matched = subjects[target].tree.query(fitted[target][nearest[source]])[1]
+        distances = subjects[target].distances[np.arange(len(matched)), matched]
+        errors.append(distances.astype(np.float64) * CM_PER_UNIT)
     return np.array(errors)

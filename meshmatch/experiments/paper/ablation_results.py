@@ -1,10 +1,10 @@
-"""The paper's tables and claims, read off what is known of the ablation runs.
+"""Tables of the ablation runs, and tests of the paper's claims.
 
-Training again from another seed moves errors by as much as many choices do, and a set has few shapes. So an order of two
-errors is there only where 95 % intervals of their difference leave out 0: over seeds (Welch's, of at least two trainings
-each), and over what was measured on, held-out bodies or the shapes of a set (a paired bootstrap; of shapes, not of pairs,
-for a hard shape is hard in all of its pairs). A claim is *supported* if every next error is larger, *not supported* if one
-is smaller, and else *not testable here*.
+Training with another seed changes errors as much as many of the choices, and sets have few shapes. The order of two errors
+is therefore significant only if the 95 % intervals of their difference exclude 0, both over seeds (Welch's t-test, at least
+two trainings each) and over the data, held-out bodies or the shapes of a set (paired bootstrap; over shapes, not pairs, as
+a difficult shape is difficult in all of its pairs). A claim is *supported* if every error is significantly larger than the
+one before it, *not supported* if one is significantly smaller, and otherwise *not testable here*.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from meshmatch.experiments.paper.ablation_views import (
     PAPER_SETS,
     TABLE4,
     VIEWS,
-    Known,
+    Measurements,
     Run,
     View,
 )
@@ -38,7 +38,7 @@ from meshmatch.experiments.runner import table
 
 SUPPORTED, NOT_SUPPORTED, UNTESTED = "supported", "not supported", "not testable here"
 _DRAWS = 4000
-_UNMEASURED = "not measured"
+_NOT_MEASURED = "not measured"
 CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
     (
         "with vol+arap+Z: mls < rbf < pointwise",
@@ -65,7 +65,7 @@ CLAIMS: tuple[tuple[str, tuple[Run, ...]], ...] = (
         for words, few in (("250 shapes", {"shapes": 250}), ("50 supervised points", {"supervised": 50}))
     ),
 )
-"""What the paper says of errors: the runs in the order from the least error to the largest."""
+"""Claims of the paper: the runs in order of increasing error."""
 _REFINED = {
     "refined with regularisers < by Chamfer alone < not at all": ("code", "chamfer", "none"),
     "of it: with regularisers < not at all": ("code", "none"),
@@ -74,8 +74,11 @@ _REFINED = {
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement, where it was looked at, mean errors from the one that should be least to the largest, and what became
-    of it; an interval for every difference of neighbours, None where there are too few seeds."""
+    """A claim, the set on which it was tested, and the verdict.
+
+    ``numbers`` are mean errors in the claimed order of increase; ``intervals`` are those of the differences of successive
+    errors, None if there are too few seeds.
+    """
 
     words: str
     where: str
@@ -86,8 +89,8 @@ class Claim:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Mean errors of the trainings of one choice, and by each of them the errors of every body, or of all ordered pairs of
-    so many ``shapes``."""
+    """Errors of one choice: the mean error of each training (``seeds``), and for ``each`` training the errors of all bodies
+    or, if ``shapes`` is not 0, of all ordered pairs of that number of shapes."""
 
     seeds: Sequence[float]
     each: Sequence[Sequence[float]] = ()
@@ -95,93 +98,97 @@ class Sample:
 
 
 def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float] | None:
-    """The hull of the 95 % intervals of b's error less a's, over seeds and over shapes; None where there are too few seeds.
+    """Hull of the 95 % intervals of b's error minus a's, over seeds and over the data; None if there are too few seeds.
 
-    ``paired``: both are of the same networks.
+    ``paired`` if both are errors of the same networks.
     """
     if min(len(a.seeds), len(b.seeds)) < 2:
         return None
-    still = np.ptp(np.subtract(a.seeds, b.seeds)) == 0 if paired else np.ptp(a.seeds) == np.ptp(b.seeds) == 0
-    if still:
+    no_variance = np.ptp(np.subtract(a.seeds, b.seeds)) == 0 if paired else np.ptp(a.seeds) == np.ptp(b.seeds) == 0
+    if no_variance:
         ends = [float(np.mean(b.seeds) - np.mean(a.seeds))] * 2
     else:
         test = ttest_rel(b.seeds, a.seeds) if paired else ttest_ind(b.seeds, a.seeds, equal_var=False)
         over_seeds = test.confidence_interval(0.95)
         ends = [float(over_seeds.low), float(over_seeds.high)]
     if a.each and b.each:
-        off = np.mean(b.each, axis=0) - np.mean(a.each, axis=0)
-        if np.ptp(off) > 0:
-            ends += over_shapes(off, a.shapes) if a.shapes else over_bodies(off)
+        change = np.mean(b.each, axis=0) - np.mean(a.each, axis=0)
+        if np.ptp(change) > 0:
+            ends += shapes_interval(change, a.shapes) if a.shapes else bodies_interval(change)
     return min(ends), max(ends)
 
 
-def over_bodies(off: Floats) -> list[float]:
-    """The ends of the 95 % interval of a mean of independent numbers."""
+def bodies_interval(differences: Floats) -> list[float]:
+    """95 % interval of the mean of independent numbers, by bootstrap."""
     rng = np.random.default_rng(0)
-    drawn = bootstrap((off,), np.mean, n_resamples=_DRAWS, method="percentile", rng=rng).confidence_interval
+    drawn = bootstrap((differences,), np.mean, n_resamples=_DRAWS, method="percentile", rng=rng).confidence_interval
     return [float(drawn.low), float(drawn.high)]
 
 
-def over_shapes(off: Floats, shapes: int) -> list[float]:
-    """The ends of the 95 % interval of a mean over all ordered pairs of so many shapes, which are drawn with all their
-    pairs; none of a shape with itself.
+def shapes_interval(differences: Floats, shapes: int) -> list[float]:
+    """95 % interval of the mean over all ordered pairs of different shapes, by a bootstrap that draws shapes with all of
+    their pairs.
     """
-    between = np.zeros((shapes, shapes))
-    between[~np.eye(shapes, dtype=bool)] = off
-    often = np.random.default_rng(0).multinomial(shapes, [1 / shapes] * shapes, _DRAWS).astype(float)
-    pairs = shapes**2 - np.square(often).sum(1)
-    some = pairs > 0
-    means = ((often @ between) * often).sum(1)[some] / pairs[some]
+    matrix = np.zeros((shapes, shapes))
+    matrix[~np.eye(shapes, dtype=bool)] = differences
+    counts = np.random.default_rng(0).multinomial(shapes, [1 / shapes] * shapes, _DRAWS).astype(float)
+    n_pairs = shapes**2 - np.square(counts).sum(1)
+    valid = n_pairs > 0
+    means = ((counts @ matrix) * counts).sum(1)[valid] / n_pairs[valid]
     return [float(each) for each in np.percentile(means, [2.5, 97.5])]
 
 
-def rising(where: str, words: str, samples: Sequence[Sample], paired: bool = False) -> Claim:
-    """Whether every next error is larger."""
+def check_increase(where: str, words: str, samples: Sequence[Sample], paired: bool = False) -> Claim:
+    """Test whether every error is larger than the one before it."""
     if not all(sample.seeds for sample in samples):
-        return Claim(words, where, _UNMEASURED)
+        return Claim(words, where, _NOT_MEASURED)
     numbers = tuple(float(np.mean(sample.seeds)) for sample in samples)
-    found = tuple(difference(a, b, paired) for a, b in pairwise(samples))
-    if any(each is not None and each[1] < 0 for each in found):
-        return Claim(words, where, NOT_SUPPORTED, numbers, found)
-    held = all(each is not None and each[0] > 0 for each in found)
-    return Claim(words, where, SUPPORTED if held else UNTESTED, numbers, found)
+    intervals = tuple(difference(a, b, paired) for a, b in pairwise(samples))
+    if any(each is not None and each[1] < 0 for each in intervals):
+        return Claim(words, where, NOT_SUPPORTED, numbers, intervals)
+    all_larger = all(each is not None and each[0] > 0 for each in intervals)
+    return Claim(words, where, SUPPORTED if all_larger else UNTESTED, numbers, intervals)
 
 
-def sample(known: Known, run: Run, where: str, method: str | None = None) -> Sample:
-    """What is known of a run on the held-out shapes or a set."""
-    records = known.records(run, where, method)
+def sample(measured: Measurements, run: Run, where: str, method: str | None = None) -> Sample:
+    """Errors of a run on the held-out shapes or on a set."""
+    records = measured.records(run, where, method)
     each = [found["pair_cm"] for found in records if found.get("pair_cm")]
     shapes = 0 if where == HELD_OUT or not each else (1 + math.isqrt(1 + 4 * len(each[0]))) // 2
     return Sample([found["mean_cm"] for found in records], each, shapes)
 
 
-def claims(known: Known, sets: Sequence[str]) -> list[Claim]:
+def claims(measured: Measurements, sets: Sequence[str]) -> list[Claim]:
     """All claims, on the held-out shapes and each set; 300 nodes of radius 0.2 beside the best of the other grid points."""
-    found = []
+    results_list = []
     for where in (HELD_OUT, *sets):
-        asked = {words: [sample(known, run, where) for run in runs] for words, runs in CLAIMS}
-        others = [each for run in GRID if run != BASE and (each := sample(known, run, where)).seeds]
+        samples_by_claim = {words: [sample(measured, run, where) for run in runs] for words, runs in CLAIMS}
+        others = [each for run in GRID if run != BASE and (each := sample(measured, run, where)).seeds]
         best = min(others, key=lambda each: float(np.mean(each.seeds)), default=Sample(()))
-        asked["300 nodes of radius 0.2 are the best of the grid"] = [sample(known, BASE, where), best]
+        samples_by_claim["300 nodes of radius 0.2 are the best of the grid"] = [sample(measured, BASE, where), best]
         if where != HELD_OUT:
             for words, hows in _REFINED.items():
-                found.append(rising(where, words, [sample(known, BASE, where, how) for how in hows], paired=True))
-        found += [rising(where, words, samples) for words, samples in asked.items()]
-    return found
+                results_list.append(
+                    check_increase(where, words, [sample(measured, BASE, where, how) for how in hows], paired=True)
+                )
+        results_list += [check_increase(where, words, samples) for words, samples in samples_by_claim.items()]
+    return results_list
 
 
-def claims_table(found: Sequence[Claim]) -> Table:
-    """Each claim that was measured in a row, its verdicts on the held-out shapes and each set, with the intervals."""
+def claims_table(claims: Sequence[Claim]) -> Table:
+    """Table with a row for each tested claim: its verdicts on the held-out shapes and each set, with intervals."""
     rows: dict[str, dict[str, str]] = {}
-    for claim in (each for each in found if each.verdict != _UNMEASURED):
-        known = "; ".join("one seed" if each is None else f"{each[0]:.2f} to {each[1]:.2f}" for each in claim.intervals)
-        rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = f"{claim.verdict} ({known})"
-    columns = {"claim": "claim", **{claim.where: claim.where for claim in found}}
+    for claim in (each for each in claims if each.verdict != _NOT_MEASURED):
+        intervals = "; ".join(
+            "one seed" if each is None else f"{each[0]:.2f} to {each[1]:.2f}" for each in claim.intervals
+        )
+        rows.setdefault(claim.words, {"claim": claim.words})[claim.where] = f"{claim.verdict} ({intervals})"
+    columns = {"claim": "claim", **{claim.where: claim.where for claim in claims}}
     return table("What the paper claims", list(rows.values()), columns)
 
 
 def number(values: Sequence[float]) -> str:
-    """A mean, and the standard deviation of several seeds; a dash for what was not measured."""
+    """Format the mean, and the standard deviation over several seeds; a dash if there are no values."""
     if not values:
         return "-"
     words = f"{fmean(values):.2f}"
@@ -189,12 +196,12 @@ def number(values: Sequence[float]) -> str:
 
 
 def percent(values: Sequence[float]) -> str:
-    """A mean share in percent; a dash for what was not measured."""
+    """Format a mean share in percent; a dash if there are no values."""
     return f"{fmean(values):.0%}" if values else "-"
 
 
-def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> Table:
-    """Steps, held-out error, mean and median on each set beside the paper's mean."""
+def errors_table(view: View, measured: Measurements, sets: Sequence[str], budget: str) -> Table:
+    """Table of a view: steps, held-out error, and for each set mean and median error and the paper's mean."""
     columns = {head: head for head in view.heads}
     columns |= {"steps": "steps:>", "held out": "held out:>"}
     for name in sets:
@@ -203,32 +210,32 @@ def errors_table(view: View, known: Known, sets: Sequence[str], budget: str) -> 
             columns[f"{name} paper"] = f"{name} paper:.1f"
     rows = []
     for each in view.rows:
-        run, record = each.run, known.trained.get(each.run, {})
-        words = [word.format(rule=known.rule(run)) for word in each.words]
-        row: dict[str, Any] = dict(zip(view.heads, words, strict=True))
+        run, record = each.run, measured.trained.get(each.run, {})
+        labels = [word.format(rule=measured.rule(run)) for word in each.words]
+        row: dict[str, Any] = dict(zip(view.heads, labels, strict=True))
         rows.append(row)
         if "skipped" in record:
             row["steps"] = "cannot be"
             continue
-        row |= {"steps": record.get("steps", "-"), "held out": number(known.error(run, HELD_OUT))}
+        row |= {"steps": record.get("steps", "-"), "held out": number(measured.error(run, HELD_OUT))}
         for name in sets:
-            row[name] = number(known.error(run, name, each.method))
-            row[f"{name} median"] = number(known.error(run, name, each.method, "median_cm"))
-            row[f"{name} over 15"] = percent(known.error(run, name, each.method, "share_over_15cm"))
+            row[name] = number(measured.error(run, name, each.method))
+            row[f"{name} median"] = number(measured.error(run, name, each.method, "median_cm"))
+            row[f"{name} over 15"] = percent(measured.error(run, name, each.method, "share_over_15cm"))
             if each.paper is not None and name in PAPER_SETS:
                 row[f"{name} paper"] = each.paper[PAPER_SETS.index(name)]
     return table(f"{view.title}, errors in cm: {budget}", rows, columns)
 
 
-def cost_table(known: Known) -> Table:
-    """Table 4's other half: the cost of a training iteration."""
+def cost_table(measured: Measurements) -> Table:
+    """Second half of table 4: the cost of a training iteration."""
     rows = []
     for row in VIEWS["table4"].rows:
         constraint, field = row.words
-        time, paper = known.times.get(row.run.name), PAPER_MS[field][constraint]
+        time, paper = measured.times.get(row.run.name), PAPER_MS[field][constraint]
         if time is None:
             continue
-        reference, cost = cost_of(known, "mls", constraint), cost_of(known, field, constraint)
+        reference, cost = cost_of(measured, "mls", constraint), cost_of(measured, field, constraint)
         rows.append(
             {
                 **{"constraint": constraint, "field": field, **time},
@@ -241,19 +248,19 @@ def cost_table(known: Known) -> Table:
     return table("Table 4, cost of a training iteration", rows, columns)
 
 
-def cost_of(known: Known, field: str, constraint: str) -> float | None:
-    """Milliseconds of an iteration: of the processor, which other work disturbs least; on a GPU on the clock."""
-    time = known.times.get(replace(BASE, field=field, constraint=constraint).name)  # type: ignore[arg-type]
+def cost_of(measured: Measurements, field: str, constraint: str) -> float | None:
+    """Milliseconds of an iteration: CPU time, which is least affected by other load; wall time on a GPU."""
+    time = measured.times.get(replace(BASE, field=field, constraint=constraint).name)  # type: ignore[arg-type]
     return None if time is None else float(time["cpu_ms" if time["device"] == "cpu" else "ms"])
 
 
-def tables(known: Known, views: Sequence[str], sets: Sequence[str], budget: str) -> list[Table]:
-    """The tables of some views; of table 4 what there is."""
+def tables(measured: Measurements, views: Sequence[str], sets: Sequence[str], budget: str) -> list[Table]:
+    """Tables of the given views; of table 4 only the halves that were measured."""
     found = []
     for name in views:
         view = VIEWS[name]
-        if name != "table4" or any(run in known.trained for run in view.runs):
-            found.append(errors_table(view, known, sets, budget))
-        if name == "table4" and known.times:
-            found.append(cost_table(known))
+        if name != "table4" or any(run in measured.trained for run in view.runs):
+            found.append(errors_table(view, measured, sets, budget))
+        if name == "table4" and measured.times:
+            found.append(cost_table(measured))
     return found

@@ -1,8 +1,7 @@
-"""Ablation runs: their recipe, template and shapes; trained and measured on shapes that no run has seen; iterations under
-the clock.
+"""Train ablation runs, measure them on held-out shapes, and time iterations.
 
-Simulating a scan costs several times what learning from it does in a small network. So a fixed number of shapes is
-scanned a few times each beforehand, once for all runs, and a run that has fewer shapes has the first ones.
+Simulating a scan takes several times as long as training a small network on it. Therefore a fixed number of shapes is
+scanned a few times each in advance, once for all runs; a run with fewer shapes uses the first ones.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ from meshmatch.training.train import CardFacts, build_dataset, build_deformer, b
 
 _BATCHES = 2
 SCANS = 4
-"""How often each shape is scanned."""
+"""Number of scans of each shape."""
 HELD_OUT_SHAPES = 64
 _BLOCK = 50
-_SEED, _UNSEEN = 17, 999_983
+_SEED, _HELD_OUT_SEED = 17, 999_983
 
 SMALL = Recipe(
     NetworkConfig(code=256, width=384, depth=2, basis=512, align_basis=0, corrections=0),
@@ -63,9 +62,9 @@ SMALL = Recipe(
     ScanConfig(points=1024, holes=0.0, outliers=0.0, partial=0.0),
     "smooth",
 )
-"""The recipe of all runs, for minutes of one core."""
-STRAINED = 200
-"""At how many of the loss points the energies of the regularisers are taken."""
+"""Base recipe of all runs, for minutes of one core."""
+N_GRADIENT_POINTS = 200
+"""Number of loss points at which the regularisers' energies are evaluated."""
 
 
 Loss = Literal["paper", "ours"]
@@ -73,14 +72,14 @@ Loss = Literal["paper", "ours"]
 
 @dataclass(frozen=True)
 class Setting:
-    """What all runs share; plain values, so that a process of its own can be told.
+    """Settings that all runs share, as plain values that can be serialised.
 
     Parameters
     ----------
     batch : int, optional
-        Shapes of a step; None for the recipe's.
+        Shapes in a step; None for the recipe's.
     loss
-        "ours", or "paper": mean squared distances, and the weights of its table 1 for lengths in the unit sphere.
+        "ours", or "paper": mean squared distances, with the weights of its table 1, which are for the unit sphere.
     """
 
     threads: int = 1
@@ -88,55 +87,54 @@ class Setting:
     loss: Loss = "paper"
 
     def recipe(self, run: Run) -> Recipe:
-        """`SMALL` with the run's choices; constraints that it does not have weigh nothing.
+        """`SMALL` with the run's choices; the weights of constraints that it does not have are zero.
 
-        No network has an aligner or learned corrections: the orientation is given, the same to all runs, and what is
-        compared is the deformation.
+        Networks have no aligner and no learned corrections: the orientation is given and the same for all runs, to compare
+        only the deformation.
         """
-        given = SMALL.train.loss if self.loss == "ours" else _paper_loss(self.resting(run.pose))
+        base = SMALL.train.loss if self.loss == "ours" else _paper_loss(self.resting(run.pose))
         if run.constraint == TABLE3:
-            given = replace(given, volume=1e-4, arap=1e-2, blend=1.0)
+            base = replace(base, volume=1e-4, arap=1e-2, blend=1.0)
         loss = replace(
-            given,
-            volume=given.volume if "vol" in run.constraint else 0.0,
-            arap=given.arap if "arap" in run.constraint else 0.0,
-            blend=given.blend if "Z" in run.constraint else 0.0,
+            base,
+            volume=base.volume if "vol" in run.constraint else 0.0,
+            arap=base.arap if "arap" in run.constraint else 0.0,
+            blend=base.blend if "Z" in run.constraint else 0.0,
         )
         shapes = self.batch or SMALL.train.shapes
         train = replace(SMALL.train, loss=loss, shapes=shapes, threads=self.threads, seed=run.seed)
         return replace(SMALL, network=replace(SMALL.network, field=run.field), train=train, kernel=run.kernel)
 
     def template(self, run: Run) -> Template:
-        """The template with the run's nodes, chosen by its `rule`: as many as it says, their radii grown where vertices
-        lack some.
+        """The template with the run's nodes, chosen by `rule`; radii are enlarged where vertices have too few nodes.
 
         Raises
         ------
         TemplateError
-            Nodes of this number and radius do not carry it.
+            This number of nodes with this radius does not cover the template.
         """
-        return self._chosen(run)[0]
+        return self._template_and_rule(run)[0]
 
     def rule(self, run: Run) -> Strategy:
-        """By which rule its nodes are chosen: its own, or none ("uniform") where that one leaves too few."""
-        return self._chosen(run)[1]
+        """The strategy by which the run's nodes are chosen: its own, or "uniform" if that one fails."""
+        return self._template_and_rule(run)[1]
 
-    def _chosen(self, run: Run) -> tuple[Template, Strategy]:
+    def _template_and_rule(self, run: Run) -> tuple[Template, Strategy]:
         resting = self.resting(run.pose)
-        return _with_nodes(resting, run.nodes, run.radius * diameter(resting.shape), run.strategy)
+        return _place_nodes(resting, run.nodes, run.radius * diameter(resting.shape), run.strategy)
 
     def resting(self, pose: str) -> Template:
-        """The template in a pose, with the nodes that it came with; of other people in "T-heavy"."""
+        """The template in a pose with its original nodes; "T-heavy" has the shape of heavier people."""
         return _resting(pose)
 
     def sources(self, pose: str) -> tuple[Source, Source]:
-        """What draws shapes to learn from, and shapes of people that nobody learned from."""
+        """Sources of training shapes, and of shapes of other people for validation."""
         template = self.resting(pose)
         return human_source(template, 1024, 0), human_source(template, 64, 1)
 
 
 def _paper_loss(template: Template) -> CorrespondenceLoss:
-    """The paper's, for lengths in units of sqrt(area)."""
+    """The paper's loss, converted from lengths in the unit sphere to units of sqrt(area)."""
     return CorrespondenceLoss(reconstruction=1 / template_radius(template) ** 2)
 
 
@@ -147,11 +145,11 @@ def _resting(pose: str) -> Template:
 
 
 @lru_cache(maxsize=32)
-def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
+def _place_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
     for rule in dict.fromkeys((strategy, "uniform")):
         try:
-            laid = lay_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
-            return replace(template, nodes=laid.nodes, radius=laid.radius), rule
+            chosen = lay_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
+            return replace(template, nodes=chosen.nodes, radius=chosen.radius), rule
         except TemplateError:
             if rule == "uniform":
                 raise
@@ -160,15 +158,15 @@ def _with_nodes(template: Template, K: int, radius: float, strategy: Strategy) -
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Scans of N shapes, `SCANS` each, one after the other.
+    """A fixed pool of N scans: `SCANS` of each shape, one after the other.
 
     Parameters
     ----------
-    features : of the basis encoder
-    targets : where the template's loss points belong
-    basis : basis points of every run's encoder, whose features these are
-    held_out : a batch of shapes that no run learns from
-    source : draws such shapes as there are in the pool
+    features : features of the basis encoder
+    targets : correct places of the template's loss points
+    basis : basis points of the encoder, the same for all runs
+    held_out : a batch of shapes that are not used in training
+    source : draws shapes of the pool
     """
 
     features: Float[Tensor, "N M 3"]
@@ -178,8 +176,10 @@ class Pool:
     source: Source
 
     def batch(self, step: int, count: int, shapes: int, seed: int) -> Batch:
-        """The batch of a step, of the scans of the first ``shapes``: a function of its arguments. The encoder reads features
-        alone, so that there are no points."""
+        """Batch of a step from the scans of the first ``shapes``, determined by the arguments.
+
+        It has no points, as the encoder needs only the features.
+        """
         generator = torch.Generator().manual_seed((seed * 2_654_435_761 + step) % (2**63))
         chosen = torch.randint(min(shapes * SCANS, len(self.targets)), (count,), generator=generator)
         return Batch(torch.zeros(count, 0, 3), self.targets[chosen], self.features[chosen])
@@ -187,55 +187,55 @@ class Pool:
 
 @lru_cache(maxsize=8)
 def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes) -> Pool:
-    """The pool of a template pose, drawn once in a process."""
+    """The pool of a template pose, drawn once per process."""
     template, recipe = setting.resting(pose), setting.recipe(Run(pose=pose))
-    source, unseen = setting.sources(pose)
+    source, held_out_source = setting.sources(pose)
     generator = torch.Generator().manual_seed(_SEED)
-    drawn = torch.cat([source(min(_BLOCK, shapes - at), generator) for at in range(0, shapes, _BLOCK)])
+    shapes_drawn = torch.cat([source(min(_BLOCK, shapes - at), generator) for at in range(0, shapes, _BLOCK)])
 
-    def some(count: int, generator: torch.Generator) -> Tensor:
-        return drawn[torch.randint(len(drawn), (count,), generator=generator)]
+    def draw(count: int, generator: torch.Generator) -> Tensor:
+        return shapes_drawn[torch.randint(len(shapes_drawn), (count,), generator=generator)]
 
-    model = build_deformer(template, some, recipe.network, recipe.scan, recipe.kernel, _SEED)
-    data = build_dataset(template, some, model, recipe.scan, _BLOCK, SCANS, _SEED)
+    model = build_deformer(template, draw, recipe.network, recipe.scan, recipe.kernel, _SEED)
+    data = build_dataset(template, draw, model, recipe.scan, _BLOCK, SCANS, _SEED)
     features, targets = [], []
-    for number, block in enumerate(drawn.split(_BLOCK)):
+    for number, block in enumerate(shapes_drawn.split(_BLOCK)):
         batch = replace(data, source=lambda *_, block=block: block, shapes=len(block))[number]
         features.append(batch.encode_features)
         targets.append(batch.targets)
-    held_out = replace(data, source=unseen, shapes=HELD_OUT_SHAPES, scans_per_shape=1, seed=_UNSEEN)[0]
+    held_out = replace(data, source=held_out_source, shapes=HELD_OUT_SHAPES, scans_per_shape=1, seed=_HELD_OUT_SEED)[0]
     assert isinstance(model.encoder, BasisEncoder)
-    return Pool(torch.cat(features), torch.cat(targets), model.encoder.basis.clone(), held_out, some)
+    return Pool(torch.cat(features), torch.cat(targets), model.encoder.basis.clone(), held_out, draw)
 
 
 def train_run(run: Run, setting: Setting, folder: Path, steps: int) -> dict[str, Any]:
-    """Train, write a model folder, and say how it went. The rate falls to 0 at the last step.
+    """Train a run, write a model folder, and return a summary. The learning rate decays to 0 at the last step.
 
-    On the way a checkpoint lies beside the folder; a training that was stopped goes on from it, exactly.
+    A checkpoint next to the folder allows an interrupted training to resume exactly.
 
     Returns
     -------
     dict
-        ``steps``, ``seconds``, ``held_out_cm`` (the network alone), ``bodies_cm`` (of each body), ``nodes``, ``rule``,
-        ``model`` (what tells its weights from others).
+        ``steps``, ``seconds``, ``held_out_cm`` (without refinement), ``bodies_cm`` (for each body), ``nodes``, ``rule``,
+        ``model`` (hash of its weights).
     """
     set_threads(setting.threads)
     template, recipe = setting.template(run), setting.recipe(run)
     pool = pool_of(setting, run.pose)
     model = new_network(run, setting, pool)
-    points = build_loss_points(template, recipe.kernel, model, gradients=STRAINED)
-    trainer = Trainer(model, fewer(points, run.supervised), replace(recipe.train, steps=steps))
+    points = build_loss_points(template, recipe.kernel, model, gradients=N_GRADIENT_POINTS)
+    trainer = Trainer(model, keep_first_points(points, run.supervised), replace(recipe.train, steps=steps))
     make_folder(folder.parent)
     checkpoint = folder.parent / f"checkpoint-{steps}.safetensors"
     if checkpoint.is_file():
         trainer.load(checkpoint)
     model.train()
-    spent, began = trainer.seconds, time.monotonic()
-    saved = began
+    seconds_before, start = trainer.seconds, time.monotonic()
+    saved = start
     while trainer.step < steps:
         batch = pool.batch(trainer.step, recipe.train.shapes, run.shapes, run.seed)
         trainer.iterate(replace(batch, targets=batch.targets[:, : run.supervised]))
-        trainer.seconds = spent + time.monotonic() - began
+        trainer.seconds = seconds_before + time.monotonic() - start
         if time.monotonic() - saved > 60 * recipe.train.checkpoint_minutes:
             trainer.save(checkpoint)
             saved = time.monotonic()
@@ -262,24 +262,24 @@ def train_run(run: Run, setting: Setting, folder: Path, steps: int) -> dict[str,
 
 @torch.no_grad()
 def body_errors(model: Deformer, batch: Batch, points: LossPoints) -> Float[torch.Tensor, " B"]:
-    """Mean distance of the template's points from their places on each body (units of sqrt(area)), float64."""
-    was = model.training
+    """Mean distance of the template's points from their correct places for each body, units of sqrt(area), float64."""
+    was_training = model.training
     model.eval()
     batch = batch.to(points.positions.device)
-    off = points.moved(model(batch.points)) - batch.targets
-    model.train(was)
-    result: Tensor = off.double().norm(dim=-1).mean(1).cpu()
+    offsets = points.moved(model(batch.points)) - batch.targets
+    model.train(was_training)
+    result: Tensor = offsets.double().norm(dim=-1).mean(1).cpu()
     return result
 
 
 def _wait(trainer: Trainer) -> None:
-    """Until a GPU has done what it was asked: it works on while Python does, and clocks must not."""
+    """Wait until the GPU has finished, as required for timing."""
     if trainer.device.type == "cuda":
         torch.cuda.synchronize(trainer.device)
 
 
 def new_network(run: Run, setting: Setting, pool: Pool) -> Deformer:
-    """A run's untrained network; its encoder's basis points are those of the pool, whatever the seed."""
+    """Build a run's untrained network; the basis points of its encoder are those of the pool for every seed."""
     template, recipe = setting.template(run), setting.recipe(run)
     model = build_deformer(template, pool.source, recipe.network, recipe.scan, recipe.kernel, run.seed)
     assert isinstance(model.encoder, BasisEncoder)
@@ -288,8 +288,8 @@ def new_network(run: Run, setting: Setting, pool: Pool) -> Deformer:
     return model
 
 
-def fewer(points: LossPoints, supervised: int) -> LossPoints:
-    """The first loss points alone; regularised where all would be."""
+def keep_first_points(points: LossPoints, supervised: int) -> LossPoints:
+    """Keep only the first loss points; the regularisers' points do not change."""
     if supervised >= len(points.positions):
         return points
     field: PointField = points.field
@@ -300,13 +300,13 @@ def fewer(points: LossPoints, supervised: int) -> LossPoints:
     return LossPoints(points.positions[:supervised], field)
 
 
-def built(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:
-    """A trainer at its first step, and batches for it."""
+def build_trainer(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:
+    """Build a trainer at its first step, and batches for it."""
     chosen, template, source = setting.recipe(run), setting.template(run), setting.sources(run.pose)[0]
     train = chosen.train
     model = build_deformer(template, source, chosen.network, chosen.scan, chosen.kernel, train.seed)
-    points = build_loss_points(template, chosen.kernel, model, gradients=STRAINED)
-    trainer = Trainer(model, fewer(points, run.supervised), train)
+    points = build_loss_points(template, chosen.kernel, model, gradients=N_GRADIENT_POINTS)
+    trainer = Trainer(model, keep_first_points(points, run.supervised), train)
     data = build_dataset(
         template, source, model, chosen.scan, train.shapes, train.scans_per_shape, train.seed, _BATCHES
     )
@@ -315,27 +315,27 @@ def built(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:
     return trainer, [replace(each, targets=each.targets[:, : run.supervised]) for each in batches]
 
 
-def timed(setting: Setting, runs: Sequence[Run], rounds: int) -> dict[str, dict[str, Any]]:
-    """Milliseconds of an iteration, by name of the run: forward, backward and the optimizer's step, batches at hand.
+def time_iterations(setting: Setting, runs: Sequence[Run], rounds: int) -> dict[str, dict[str, Any]]:
+    """Milliseconds per iteration (forward, backward, optimiser step; without drawing batches), by the name of the run.
 
-    All are in one process and take turns: in each round every run does one iteration, each round beginning with another,
-    so that what else the machine does disturbs all alike. One round before the first does not count.
+    All runs are timed in one process. In each round every run does one iteration, and each round begins with another run,
+    so that other load on the machine affects all runs equally. One round before the first is a warm-up.
     """
     set_threads(setting.threads)
-    ready = [(run, *built(setting, run)) for run in runs]
+    prepared = [(run, *build_trainer(setting, run)) for run in runs]
     wall: dict[str, list[float]] = {run.name: [] for run in runs}
     cpu: dict[str, list[float]] = {run.name: [] for run in runs}
-    for turn in range(-1, rounds):
-        first = max(turn, 0) % len(ready)
-        for run, trainer, batches in ready[first:] + ready[:first]:
+    for round_ in range(-1, rounds):
+        first = max(round_, 0) % len(prepared)
+        for run, trainer, batches in prepared[first:] + prepared[:first]:
             _wait(trainer)
-            began, worked = time.perf_counter(), time.process_time()
-            trainer.iterate(batches[turn % _BATCHES])
+            wall_start, cpu_start = time.perf_counter(), time.process_time()
+            trainer.iterate(batches[round_ % _BATCHES])
             _wait(trainer)
-            if turn >= 0:
-                wall[run.name].append(1e3 * (time.perf_counter() - began))
-                cpu[run.name].append(1e3 * (time.process_time() - worked))
-    device = str(ready[0][1].device)
+            if round_ >= 0:
+                wall[run.name].append(1e3 * (time.perf_counter() - wall_start))
+                cpu[run.name].append(1e3 * (time.process_time() - cpu_start))
+    device = str(prepared[0][1].device)
     return {
         run.name: {
             "ms": round(statistics.median(wall[run.name]), 3),

@@ -1,7 +1,7 @@
-"""The paper's tables and figures as data: which runs each looks at, and what the paper printed.
+"""The paper's tables and figures as data: the runs that each one shows, and the paper's numbers.
 
-A run is one training: a choice in everything that the paper varies. All tables and figures are views of the same runs,
-most of which differ from `BASE` in one thing.
+A run is one training, with a value for everything that the paper varies. All tables and figures are views of the same runs,
+most of which differ from `BASE` in one setting.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from meshmatch.geometry.kernels import Kernel
 from meshmatch.templates.make import STRATEGIES, Strategy
 
 TABLE3 = "vol+arap+Z of table 3"
-"""The weights that are meant for interpolation; others are of table 1."""
+"""The weights for interpolation; all other constraints have the weights of table 1."""
 CONSTRAINTS = ("none", "arap", "vol", "vol+arap", "vol+arap+Z")
 PAPER_SETS = ("shrec19", "scape-pcn")
 HELD_OUT = "held out"
 HEAVY = "-heavy"
 POSES = ("T", "A", "I", f"T{HEAVY}")
-"""Of the template; the last is of other people."""
+"""Poses of the template; the last one has the shape of heavier people."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class Run:
 
     Parameters
     ----------
-    field, kernel : of the deformation
+    field, kernel : deformation field and its kernel
     constraint : one of `CONSTRAINTS`, or `TABLE3`
     nodes, radius : K, and r in the paper's unit
-    strategy : how nodes are chosen
-    pose : of the template, one of `POSES`
-    shapes : how many there are to learn from
-    supervised : on how many template points the right place is told
-    steps : of its training; 0 for as many as the command says
+    strategy : method to choose nodes
+    pose : pose of the template, one of `POSES`
+    shapes : number of training shapes
+    supervised : number of template points with supervision
+    steps : training steps; 0 for the number of the command
     """
 
     field: FieldName = "mls"
@@ -54,7 +54,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Of its folder: in what it differs from the base."""
+        """Name of the run's folder: the settings that differ from the base."""
         parts = [
             f"{each.name}-{getattr(self, each.name)}".replace("+", "-").replace(" ", "-").lower()
             for each in fields(self)
@@ -70,8 +70,8 @@ CODED = replace(BASE, field="pointwise", constraint="none")
 
 @dataclass(frozen=True)
 class Row:
-    """A row: words ("{rule}" stands for how nodes were chosen in the end), the run, the paper's errors in cm on
-    `PAPER_SETS`, and the refinement."""
+    """A row of a view: labels ("{rule}" stands for the strategy that was used in the end), the run, the paper's errors in cm
+    on `PAPER_SETS`, and the refinement."""
 
     words: tuple[str, ...]
     run: Run
@@ -81,7 +81,7 @@ class Row:
 
 @dataclass(frozen=True)
 class View:
-    """A table or figure: its title, the headings of its rows' words, and rows."""
+    """A table or figure: title, headings of the labels, and rows."""
 
     title: str
     heads: tuple[str, ...]
@@ -89,7 +89,7 @@ class View:
 
     @property
     def runs(self) -> list[Run]:
-        """Each run once, the base first."""
+        """The runs without duplicates, the base first."""
         return sorted(dict.fromkeys(row.run for row in self.rows), key=lambda run: run != BASE)
 
 
@@ -120,7 +120,7 @@ _PAPER7 = {
     ("uniform", "T"): (5.1, 6.9), ("uniform", "A"): (5.9, 9.5),
 }  # fmt: skip
 LENGTHS = (1_000, 3_000, 10_000, 30_000)
-"""Steps of training at which one asks whether errors still fall."""
+"""Training steps at which convergence is checked."""
 PAPER_MS = {
     "pointwise": {"none": 32.0, "vol+arap": 250.4, "vol+arap+Z": 4098.3},
     "rbf": {"none": 8.0, "vol+arap": 8.2, "vol+arap+Z": 12.6},
@@ -132,7 +132,7 @@ GRID = tuple(replace(BASE, nodes=K, radius=r) for K, r in _PAPER6)
 
 
 def _numbers(name: str, counts: Sequence[int]) -> tuple[Row, ...]:
-    """Ours and 3D-CODED, which see as many scans in as many steps."""
+    """Rows of ours and of 3D-CODED for several values of a setting; both see the same number of scans."""
     return tuple(
         Row((str(count), words), replace(run, **{name: count}))  # type: ignore[arg-type]
         for words, run in (("ours", BASE), ("3D-CODED", CODED))
@@ -193,26 +193,26 @@ VIEWS = {
         ),
     ),
 }
-"""In the order in which their runs are trained."""
+"""All views, in the order in which their runs are trained."""
 
 
 def all_runs(views: Sequence[str], seeds: int = 1, repeated: Sequence[str] = ()) -> list[Run]:
-    """Every run of some views once; last, those of the ``repeated`` views with other seeds."""
+    """All runs of the given views without duplicates, followed by those of the ``repeated`` views with other seeds."""
     runs = list(dict.fromkeys(run for view in VIEWS if view in views for run in VIEWS[view].runs))
-    alike = dict.fromkeys(run for view in VIEWS if view in repeated for run in VIEWS[view].runs)
-    again = [replace(run, seed=seed) for seed in range(1, seeds) for run in alike if run in runs]
-    return [*runs, *again]
+    repeated_runs = dict.fromkeys(run for view in VIEWS if view in repeated for run in VIEWS[view].runs)
+    repetitions = [replace(run, seed=seed) for seed in range(1, seeds) for run in repeated_runs if run in runs]
+    return [*runs, *repetitions]
 
 
 def methods_of(run: Run) -> tuple[str, ...]:
-    """With which refinements a run is measured, whatever its seed: the paper's, then those of table 5 where it looks."""
+    """Refinements with which a run is evaluated: the paper's, and for the base those of table 5."""
     return ("code", "none", "chamfer") if replace(run, seed=BASE.seed) == BASE else ("code",)
 
 
 @dataclass(frozen=True)
-class Known:
-    """What was measured: ``trained`` as `train_run` tells it, or {"skipped": why}; ``errors`` by run, set and method;
-    ``times`` of an iteration by name of the run.
+class Measurements:
+    """Measurements: ``trained`` has the results of `train_run`, or {"skipped": reason}; ``errors`` are by run, set and
+    method; ``times`` of an iteration are by the name of the run.
     """
 
     trained: Mapping[Run, Mapping[str, Any]]
@@ -220,18 +220,24 @@ class Known:
     times: Mapping[str, Mapping[str, Any]]
 
     def rule(self, run: Run) -> str:
-        """How nodes were chosen in the end."""
+        """Strategy by which the nodes were chosen in the end."""
         return str(self.trained.get(run, {}).get("rule", run.strategy))
 
     def records(self, run: Run, where: str, method: str | None = None) -> list[Mapping[str, Any]]:
-        """What is known of a run and its repetitions with other seeds: on a set after a refinement (by default the first of
-        `methods_of`), or held out, as the training told it."""
-        alike = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
+        """Records of a run and its repetitions with other seeds: on a set after a refinement (by default the first of
+        `methods_of`), or on held-out shapes."""
+        repetitions = sorted((each for each in self.trained if replace(each, seed=0) == run), key=lambda r: r.seed)
         if where == HELD_OUT:
-            kept = [self.trained[each] for each in alike]
-            return [{"mean_cm": one["held_out_cm"], "pair_cm": one.get("bodies_cm")} for one in kept if "steps" in one]
-        how = method or methods_of(run)[0]
-        return [self.errors[each, where, how] for each in alike if (each, where, how) in self.errors]
+            summaries = [self.trained[each] for each in repetitions]
+            return [
+                {"mean_cm": summary["held_out_cm"], "pair_cm": summary.get("bodies_cm")}
+                for summary in summaries
+                if "steps" in summary
+            ]
+        refinement = method or methods_of(run)[0]
+        return [
+            self.errors[each, where, refinement] for each in repetitions if (each, where, refinement) in self.errors
+        ]
 
     def error(self, run: Run, where: str, method: str | None = None, what: str = "mean_cm") -> list[float]:
         """Errors in cm of a run and its repetitions; ``what`` is "mean_cm", or on a set "median_cm"."""

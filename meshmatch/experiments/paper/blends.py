@@ -1,11 +1,11 @@
-"""What the weights of the paper's table 3, which are meant for interpolation, do to blends of codes.
+"""Effect on blends of codes of the weights in the paper's table 3, which are for interpolation.
 
-Small networks (`ablation_training`) are trained from the beginning without regularisers, with the weights of table 1 and
-with those of table 3. They encode bodies of people that nobody learned from. Halfway between the codes of every two
-neighbours in a batch, and at the codes themselves, the deformation gradient F is asked for its energies, without weights:
-(det F - 1)^2 for volume, |F^T F - I| for rigidity; mean over the template. A body has energies of its own, for it is not the
-template: the path is better than its ends where the energies halfway are lower. Held out is the mean distance of the
-template's points from where they belong, in cm at 1.9 m2 of skin.
+Small networks (`ablation_training`) are trained from scratch without regularisers, with the weights of table 1 and with
+those of table 3. They encode held-out bodies. At the codes, and halfway between those of neighbors in a batch, the
+unweighted energies of the deformation gradient F are computed: (det F - 1)^2 for volume, |F^T F - I| for rigidity, as means
+over the template. Bodies themselves have positive energies, as they differ from the template: a blend is better than its
+ends if its energies are lower. Held out is the mean distance of the template's points from their correct places, in cm at
+1.9 m2 of skin.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typer import Option
 
 from meshmatch.api.inputs import as_model
 from meshmatch.experiments import runner
-from meshmatch.experiments.paper.ablation_training import STRAINED, Setting, pool_of, train_run
+from meshmatch.experiments.paper.ablation_training import N_GRADIENT_POINTS, Setting, pool_of, train_run
 from meshmatch.experiments.paper.ablation_views import BASE, TABLE3, Run
 from meshmatch.fields.field import arap_energy, volume_energy
 from meshmatch.training.train import build_loss_points
@@ -35,19 +35,19 @@ _COLUMNS |= {f"{name}, {where}": f"{name}_{key}:>" for name in ("volume", "rigid
 
 @torch.no_grad()
 def energies(model: Any, run: Run, setting: Setting) -> dict[str, float]:
-    """Mean energies at the codes of held-out bodies and halfway between those of neighbours."""
+    """Mean energies at the codes of held-out bodies, and halfway between those of neighbors in the batch."""
     network = model.network.eval()
-    points = build_loss_points(model.template, setting.recipe(run).kernel, network, gradients=STRAINED)
+    points = build_loss_points(model.template, setting.recipe(run).kernel, network, gradients=N_GRADIENT_POINTS)
     code = network.encoder(pool_of(setting, run.pose).held_out.encode_features)
-    found: dict[str, float] = {}
-    for where, at in (("ends", code), ("halfway", 0.5 * (code + code.roll(1, 0)))):
-        F = points.field.deformation_gradient(network.decoder(at))
-        found |= {f"volume_{where}": float(volume_energy(F).mean()), f"rigidity_{where}": float(arap_energy(F).mean())}
-    return found
+    means: dict[str, float] = {}
+    for where, codes in (("ends", code), ("halfway", 0.5 * (code + code.roll(1, 0)))):
+        F = points.field.deformation_gradient(network.decoder(codes))
+        means |= {f"volume_{where}": float(volume_energy(F).mean()), f"rigidity_{where}": float(arap_energy(F).mean())}
+    return means
 
 
 def row_of(words: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over seeds, and how far apart they are."""
+    """Row of the table: means over seeds, with standard deviations."""
     row: dict[str, Any] = {"weights": words, "steps": runs[0]["steps"]}
     for name in runs[0]:
         if name.startswith(("held", "volume", "rigidity")):
@@ -59,26 +59,26 @@ def row_of(words: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 @runner.command
 def main(
-    steps: Annotated[int, Option(min=1, help="of every training")] = 10_000,
-    seeds: Annotated[int, Option(min=1, help="trainings with the same weights")] = 3,
+    steps: Annotated[int, Option(min=1, help="steps of every training")] = 10_000,
+    seeds: Annotated[int, Option(min=1, help="number of trainings with the same weights")] = 3,
     work: runner.Work = None,
     threads: runner.Threads = 1,
 ) -> runner.Report:
     setting, rows = Setting(threads), []
-    every: dict[str, list[dict[str, Any]]] = {}
+    results: dict[str, list[dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as temporary:
-        place = work or Path(temporary)
+        folder = work or Path(temporary)
         for words, constraint in WEIGHTS.items():
-            every[words] = []
+            results[words] = []
             for seed in range(seeds):
                 run = replace(BASE, constraint=constraint, seed=seed)
 
                 def measure(run: Run = run) -> dict[str, Any]:
                     runner.tell(f"training {run.name}: {steps} steps")
-                    trained = train_run(run, setting, place / run.name / "model", steps)
-                    return {**trained, **energies(as_model(place / run.name / "model"), run, setting)}
+                    trained = train_run(run, setting, folder / run.name / "model", steps)
+                    return {**trained, **energies(as_model(folder / run.name / "model"), run, setting)}
 
                 asked = {"run": asdict(run), "setting": asdict(setting), "steps": steps}
-                every[words].append(runner.once(place / run.name / "measured.json", asked, measure))
-            rows.append(row_of(words, every[words]))
-    return runner.Report({"rows": every}, [runner.table("Energies of blended codes", rows, _COLUMNS)])
+                results[words].append(runner.once(folder / run.name / "measured.json", asked, measure))
+            rows.append(row_of(words, results[words]))
+    return runner.Report({"rows": results}, [runner.table("Energies of blended codes", rows, _COLUMNS)])

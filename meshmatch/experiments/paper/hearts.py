@@ -1,9 +1,10 @@
-"""Figure 14: the chambers of one heart, carried to others by three methods.
+"""Figure 14: transfer of the chambers of one heart to others, by three methods.
 
-Without a model, two hearts are registered to each other; ZoomOut (pyfmaps) starts from descriptors; 3D-CODED learns from six
-of the hearts without correspondence, by the paper's losses and network, and searches codes by the Chamfer distance. The
-source is one of the six, the others are not. A heart's vertex takes the chamber of its partner on the source: shown, with
-the truth, and counted; errors are Euclidean, at the vertices whose partner is known, x 100 / sqrt(area) of the source.
+Without a model, two hearts are registered to each other; ZoomOut (pyfmaps) starts from descriptors; 3D-CODED is trained on
+six of the hearts without correspondence, with the paper's losses and network, and searches codes by the Chamfer distance.
+The source is one of the six, the targets are not. Each vertex of a target gets the chamber of its matched vertex on the
+source; the result is shown with the ground truth, and evaluated. Errors are Euclidean, at vertices with a known
+correspondence, x 100 / sqrt(area) of the source.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from meshmatch.templates.make import NodeConfig
 from meshmatch.training.recipes import paper_clouds
 from meshmatch.training.train import train
 
-_LEARNED = tuple(f"heart{k:02d}" for k in range(1, 7))
-SOURCE, TARGETS = _LEARNED[0], ("heart07", "heart09", "heart10")
+_TRAINING_NAMES = tuple(f"heart{k:02d}" for k in range(1, 7))
+SOURCE, TARGETS = _TRAINING_NAMES[0], ("heart07", "heart09", "heart10")
 _COLUMNS = {"method": "method", "pairs": "pairs:d", "mean": "mean_x100:.2f", "worst pair": "worst_pair_x100:.2f"}
 _COLUMNS |= {"right chamber": "right_chamber:.1%", "along the normals": "across_x100:.2f"}
 
 
 def learn_coded(data: Path, work: Path, steps: int) -> Path:
-    """Train 3D-CODED in a folder, or go on where that stopped; the model's folder."""
+    """Train 3D-CODED in a folder, or resume; return the model's folder."""
     if not (work / "prepared").is_dir():
         make_folder(work / "learned")
-        for name in _LEARNED:
+        for name in _TRAINING_NAMES:
             shutil.copy(data / HEART / f"{name}.ply", work / "learned")
         prepare(work / "learned", work / "prepared", PrepareConfig(nodes=NodeConfig("geodesic", 300)))
     recipe = paper_clouds().changed(field="pointwise", volume=0.0, arap=0.0, blend=0.0, steps=steps)
@@ -49,7 +50,7 @@ def learn_coded(data: Path, work: Path, steps: int) -> Path:
 
 
 def row_of_hearts(method: str, shapes: dict[str, Shape], chambers: dict[str, Int[Ints, " V"]]) -> Image.Image:
-    """The source and the targets side by side, their chambers in colors."""
+    """Picture of the source and the targets side by side, with colored chambers."""
     panels = [
         Panel(shape, label_colors(chambers[name]), f"{name}, {method if name != SOURCE else 'given'}", sharp=True)
         for name, shape in shapes.items()
@@ -62,21 +63,21 @@ def row_of_hearts(method: str, shapes: dict[str, Shape], chambers: dict[str, Int
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
-    steps: Annotated[int, Option(min=1, help="of 3D-CODED's training")] = 160,
-    code_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 200,
+    steps: Annotated[int, Option(min=1, help="training steps of 3D-CODED")] = 160,
+    code_steps: Annotated[int, Option(min=1, help="steps of its search over codes")] = 200,
     picture: Annotated[Path | None, Option(help="write a PNG")] = None,
     work: runner.Work = None,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    every, truth = load_folder(data / HEART, TRUTH)
-    shapes = {name: every[name] for name in (SOURCE, *TARGETS)}
+    all_shapes, truth = load_folder(data / HEART, TRUTH)
+    shapes = {name: all_shapes[name] for name in (SOURCE, *TARGETS)}
     known = {name: truth[name][:, 1] for name in shapes}
     rows: list[dict[str, Any]] = []
-    drawn = [row_of_hearts("truth", shapes, known)]
+    picture_rows = [row_of_hearts("truth", shapes, known)]
     with TemporaryDirectory() as temporary:
-        place = work or Path(temporary)
-        make_folder(place)
-        model = learn_coded(data, place, steps)
+        folder = work or Path(temporary)
+        make_folder(folder)
+        model = learn_coded(data, folder, steps)
         methods: dict[str, Method] = {"without a model": DirectMethod(seed), "ZoomOut": ZoomOut()}
         methods |= {"3D-CODED": coded(str(model), code_steps, seed)}
         for name, method in methods.items():
@@ -86,13 +87,13 @@ def main(
                 (each, SOURCE): method.map(shapes[each], fits[each], shapes[SOURCE], fits[SOURCE]) for each in TARGETS
             }
             rows.append({"method": name, **heart_errors(shapes, truth, maps)})
-            carried = {each: known[SOURCE][maps[each, SOURCE].index] for each in TARGETS}
-            drawn.append(row_of_hearts(name, shapes, known | carried))
+            transferred = {each: known[SOURCE][maps[each, SOURCE].index] for each in TARGETS}
+            picture_rows.append(row_of_hearts(name, shapes, known | transferred))
     if picture is not None:
-        whole = Image.new("RGB", (drawn[0].width, sum(row.height for row in drawn)), "white")
-        for number, row in enumerate(drawn):
-            whole.paste(row, (0, number * row.height))
+        sheet = Image.new("RGB", (picture_rows[0].width, sum(row.height for row in picture_rows)), "white")
+        for number, row in enumerate(picture_rows):
+            sheet.paste(row, (0, number * row.height))
         with replace_on_success(picture) as path:
-            whole.save(path, format="PNG", compress_level=9)
+            sheet.save(path, format="PNG", compress_level=9)
     title = f"Chambers of a heart on three others (3D-CODED is short: {steps} steps of training)"
     return runner.Report({"rows": rows}, [runner.table(title, rows, _COLUMNS)])

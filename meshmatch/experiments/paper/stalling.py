@@ -1,12 +1,12 @@
-"""Why the paper's own network stalls near the mean body: one thing of it changed at a time.
+"""Why the paper's own network stalls near the mean body: a study that changes one setting at a time.
 
-A network of the paper's kind, so many times narrower (--narrow), learns from generated bodies that are drawn and scanned
-once, by the paper's loss, batch and rate, for the same number of steps. Each row changes one thing. Errors are of bodies
-that no network has seen, in cm at 1.9 m2 of skin. "at work" is the error on the last training batches, with dropout and the
-statistics of each batch; "spread" how much answers differ from one body to another, as a share of how much the bodies do: 0
-where the answer is always the same. The mean body is the error of answering with the mean of all bodies, whatever the scan.
+A network as in the paper, but narrower (--narrow), is trained on a fixed pool of scanned bodies, with the paper's loss,
+batch and rate, for the same number of steps. Each row changes one setting. Errors are those of held-out bodies, in cm at
+1.9 m2 of skin. "at work" is the error on the last training batches, with dropout and the statistics of each batch. "spread"
+is the variation of the predictions relative to that of the bodies: 0 if all predictions are equal. The mean body is the
+error of always predicting the mean of all bodies.
 
-What is measured lies in the folder of --work, and a stopped command goes on with what is missing.
+Results are kept in the folder of --work: an interrupted command continues with what is missing.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from meshmatch.training.scans import yaw_rotations
 from meshmatch.training.train import build_dataset, build_deformer, build_loss_points
 
 _POINTS, _HELD_OUT, _BLOCK, _UNSEEN = 1024, 64, 50, 1
-_LAST = 20  # batches
+_LAST = 20  # number of last batches for the training error
 _COLUMNS = {"changed": "changed", "held out": "held_out:.2f", "at work": "at_work:.2f", "spread": "spread:.2f"}
 _COLUMNS |= {"CPU ms a step": "cpu_ms:.0f"}
 
 
 @dataclass(frozen=True)
 class Change:
-    """What is not as in the paper."""
+    """Settings that may differ from the paper; the defaults are the paper's."""
 
     dropout: float = 0.3
     norms: bool = True
-    waves: float = 1.0  # the frequencies' scale, in times that of the preset
+    waves: float = 1.0  # factor of the preset's frequencies
     rate: float = 1e-3
     yaw: bool = True
     encoder: str = "point"
@@ -74,21 +74,21 @@ CHANGES: Mapping[str, Change] = {
 
 
 def encoder_of(change: Change, latent: int) -> type[PointEncoder]:
-    """The paper's encoder with a change, and narrower."""
+    """Class of the paper's encoder with a change and another width."""
 
     class Changed(PointEncoder):
         def __init__(self, basis: Tensor, outputs: int) -> None:
             super().__init__(outputs, latent, dropout=change.dropout)
             self.frequencies *= change.waves
             if not change.norms:
-                kept = [layer for layer in self.points if not isinstance(layer, nn.BatchNorm1d)]
-                self.points = nn.Sequential(*kept)
+                layers = [layer for layer in self.points if not isinstance(layer, nn.BatchNorm1d)]
+                self.points = nn.Sequential(*layers)
 
     return Changed
 
 
 def network_of(change: Change, narrow: int) -> NetworkConfig:
-    """The paper's network with a change, so many times narrower."""
+    """The paper's network with a change, ``narrow`` times narrower."""
     config = replace(PAPER, code=PAPER.code // narrow, width=PAPER.width // narrow)
     if change.encoder == "basis":
         return replace(config, encoder="basis", decoder=change.decoder)  # type: ignore[arg-type]
@@ -97,18 +97,21 @@ def network_of(change: Change, narrow: int) -> NetworkConfig:
 
 @dataclass(frozen=True, eq=False)
 class Scans:
-    """Bodies, each scanned once: points, and where the template's loss points belong. The last are of other people."""
+    """Scans of bodies, one each: points, and the correct places of the template's loss points.
+
+    The last `_HELD_OUT` of them are other people, for validation.
+    """
 
     points: Float[Tensor, "N P 3"]
     targets: Float[Tensor, "N M 3"]
 
     @property
     def learned(self) -> int:
-        """How many are learned from."""
+        """Number of training scans."""
         return len(self.points) - _HELD_OUT
 
     def batch(self, model: Deformer, at: Tensor, turns: Float[Tensor, "B 3 3"] | None = None) -> Batch:
-        """Some of them, turned where asked for."""
+        """Batch of the scans with indices ``at``, optionally rotated."""
         points, targets = self.points[at], self.targets[at]
         if turns is not None:
             points, targets = points @ turns.mT, targets @ turns.mT
@@ -117,13 +120,15 @@ class Scans:
 
 
 def scans_of(template: Template, count: int, sphere: bool = True) -> Scans:
-    """Upright and clean, in the unit sphere, as the paper's, or of area 1; turned by nothing."""
+    """Draw and scan bodies: upright and clean, without rotation, in the unit sphere as in the paper, or with area 1."""
     recipe = replace(paper().scan, points=_POINTS, yaw=False, sphere=sphere)
-    seen, unseen = (human_source(template, people, seed) for people, seed in ((1024, 0), (64, _UNSEEN)))
+    training_source, held_out_source = (
+        human_source(template, people, seed) for people, seed in ((1024, 0), (64, _UNSEEN))
+    )
     points, targets = [], []
-    for source, wanted in ((seen, count), (unseen, _HELD_OUT)):
-        for first in range(0, wanted, _BLOCK):
-            size = min(_BLOCK, wanted - first)
+    for source, total in ((training_source, count), (held_out_source, _HELD_OUT)):
+        for first in range(0, total, _BLOCK):
+            size = min(_BLOCK, total - first)
             batch = build_dataset(template, source, None, recipe, size, 1, first)[0]
             points.append(batch.points)
             targets.append(batch.targets)
@@ -135,9 +140,11 @@ def _distance(a: Tensor, b: Tensor) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
-    """A network that was trained: its trainer, the loss points, and the recipe that it was made by; ``at_work`` are errors
-    of the last batches in cm, ``curve`` held-out ones now and then on the way, by steps; CPU seconds of all steps.
+class TrainedNetwork:
+    """A trained network: trainer, loss points and recipe.
+
+    ``at_work`` are the errors of the last batches in cm; ``curve`` are held-out errors during training, by step; ``seconds``
+    is the CPU time of all steps.
     """
 
     trainer: Trainer
@@ -148,18 +155,25 @@ class Learned:
     seconds: float
 
 
-def learn(
+def train_network(
     change: Change, template: Template, scans: Scans, narrow: int, steps: int, seed: int, every: int = 0
-) -> Learned:
-    """Train from the beginning, with the rate falling to nothing at the last step as `paper` says. The error of bodies that
-    it has not seen is asked after ``every`` so many steps."""
+) -> TrainedNetwork:
+    """Train from scratch, with the paper's settings and schedule except for the change.
+
+    The held-out error is computed after ``every`` so many steps, if that is not 0.
+    """
     recipe = replace(paper(), network=network_of(change, narrow))
     source = human_source(template, 1024, 0)
     model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, seed)
     points: LossPoints = build_loss_points(template, recipe.kernel, model)
     loss = replace(recipe.train.loss, reconstruction=1 / template_radius(template) ** 2)
     config = replace(recipe.train, loss=loss, steps=steps, rate=change.rate, seed=seed, workers=0)
-    trainer, generator, last, spent = Trainer(model, points, config), torch.Generator().manual_seed(seed), [], 0.0
+    trainer, generator, last_errors, seconds = (
+        Trainer(model, points, config),
+        torch.Generator().manual_seed(seed),
+        [],
+        0.0,
+    )
     curve: dict[int, float] = {}
     model.train()
     for step in range(steps):
@@ -167,19 +181,21 @@ def learn(
         batch = scans.batch(model, at, yaw_rotations(len(at), generator) if change.yaw else None)
         if step >= steps - _LAST:
             with torch.no_grad():
-                last.append(_distance(points.moved(model.decoder(model.encoder(batch.encode_features))), batch.targets))
-        worked = time.process_time()
+                last_errors.append(
+                    _distance(points.moved(model.decoder(model.encoder(batch.encode_features))), batch.targets)
+                )
+        cpu_start = time.process_time()
         trainer.iterate(batch)
-        spent += time.process_time() - worked
+        seconds += time.process_time() - cpu_start
         if every and (step + 1) % every == 0:
-            curve[step + 1] = _distance(*unseen(model, points, scans, change))
+            curve[step + 1] = _distance(*predict_held_out(model, points, scans, change))
             model.train()
             runner.tell(f"step {step + 1}: {curve[step + 1]:.2f} cm held out")
-    return Learned(trainer, points, replace(recipe, train=config), last, curve, spent)
+    return TrainedNetwork(trainer, points, replace(recipe, train=config), last_errors, curve, seconds)
 
 
-def unseen(model: Deformer, points: LossPoints, scans: Scans, change: Change) -> tuple[Tensor, Tensor]:
-    """Where a network puts the loss points on bodies that it has not seen, and where they belong."""
+def predict_held_out(model: Deformer, points: LossPoints, scans: Scans, change: Change) -> tuple[Tensor, Tensor]:
+    """Predicted and correct places of the loss points on held-out bodies."""
     model.eval()
     at = torch.arange(scans.learned, len(scans.points))
     held_out = scans.batch(model, at, yaw_rotations(len(at), torch.Generator().manual_seed(1)) if change.yaw else None)
@@ -188,19 +204,19 @@ def unseen(model: Deformer, points: LossPoints, scans: Scans, change: Change) ->
 
 
 def measure(change: Change, template: Template, scans: Scans, narrow: int, steps: int, seed: int) -> dict[str, Any]:
-    """A row: how far a network is, trained from the beginning."""
-    learned = learn(change, template, scans, narrow, steps, seed)
-    found, truth = unseen(learned.trainer.model, learned.points, scans, change)
-    spread = float((found - found.mean(0)).norm(dim=-1).mean() / (truth - truth.mean(0)).norm(dim=-1).mean())
-    row = {"held_out": _distance(found, truth), "at_work": statistics.fmean(learned.at_work), "spread": spread}
+    """Train a network from scratch and return its row of the table."""
+    learned = train_network(change, template, scans, narrow, steps, seed)
+    predicted, truth = predict_held_out(learned.trainer.model, learned.points, scans, change)
+    spread = float((predicted - predicted.mean(0)).norm(dim=-1).mean() / (truth - truth.mean(0)).norm(dim=-1).mean())
+    row = {"held_out": _distance(predicted, truth), "at_work": statistics.fmean(learned.at_work), "spread": spread}
     return row | {"mean_body": _distance(truth.mean(0), truth), "cpu_ms": 1e3 * learned.seconds / steps}
 
 
 @runner.command
 def main(
-    steps: Annotated[int, Option(min=_LAST, help="of training")] = 1000,
-    narrow: Annotated[int, Option(min=1, max=16, help="by how much the network is narrower than the paper's")] = 4,
-    bodies: Annotated[int, Option(min=1, help="that are learned from")] = 1000,
+    steps: Annotated[int, Option(min=_LAST, help="training steps")] = 1000,
+    narrow: Annotated[int, Option(min=1, max=16, help="factor by which the network is narrower than the paper's")] = 4,
+    bodies: Annotated[int, Option(min=1, help="number of training bodies")] = 1000,
     work: runner.Work = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
@@ -210,10 +226,10 @@ def main(
     scans = scans_of(template, bodies)
     for name, change in CHANGES.items():
         runner.tell(f"{name}: {steps} steps")
-        call = partial(measure, change, template, scans, narrow, steps, seed)
+        measure_change = partial(measure, change, template, scans, narrow, steps, seed)
         asked = {"change": vars(change), "narrow": narrow, "steps": steps, "bodies": bodies, "seed": seed}
-        rows.append({"changed": name, **runner.at_work(work, name.replace(" ", "-"), asked, call)})
+        rows.append({"changed": name, **runner.at_work(work, name.replace(" ", "-"), asked, measure_change)})
     means = {change.yaw: row["mean_body"] for row, change in zip(rows, CHANGES.values(), strict=True)}
-    words = [f"Mean body: {means[True]:.2f} cm, {means[False]:.2f} without turns"]
+    notes = [f"Mean body: {means[True]:.2f} cm, {means[False]:.2f} without turns"]
     title = f"The paper's network, {narrow} times narrower, after {steps} steps; errors in cm"
-    return runner.Report({"rows": rows}, [runner.table(title, rows, _COLUMNS)], words)
+    return runner.Report({"rows": rows}, [runner.table(title, rows, _COLUMNS)], notes)
