@@ -104,8 +104,8 @@ def build_table(words: str, docs: Path, above: bool = False) -> str:
     name, number = head.split()
     results = results_file(name, docs)
     table = results["tables"][int(number) - 1]
-    wanted = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
-    indices = [table["columns"].index(each) for each in wanted]
+    columns = [each.strip() for each in names.split(",") if each.strip()] or table["columns"]
+    indices = [table["columns"].index(each) for each in columns]
     rows = [[row[index] for index in indices] for row in table["rows"]]
     source = f"[{name}.json](results/{name}.json)"
     if above:
@@ -114,7 +114,7 @@ def build_table(words: str, docs: Path, above: bool = False) -> str:
         source += f": {results['date']}, commit {results['commit']}, {results['machine']}"
         if last := results.get("last_commit"):
             source += f"; to repeat it, check out {last}"
-    return f"\n{markdown(wanted, rows)}\n{source}.\n\n"
+    return f"\n{markdown(columns, rows)}\n{source}.\n\n"
 
 
 def summary(docs: Path) -> str:

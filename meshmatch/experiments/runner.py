@@ -299,13 +299,13 @@ def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        found = None
-    return as_asked(found, asked, str(path))
+        record = None
+    return as_asked(record, asked, str(path))
 
 
-def as_asked(found: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]:
+def as_asked(record: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Check a cached result; ``where`` names its origin in messages.
 
     Raises
@@ -316,7 +316,7 @@ def as_asked(found: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]
         The result is for other options than ``asked``.
     """
     try:
-        stored = dict(found["asked"])
+        stored = dict(record["asked"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{where} is not a result of this experiment", "remove it to measure again") from error
     requested = plain(asked)
@@ -325,12 +325,12 @@ def as_asked(found: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]
             f"{where} was measured with other options ({', '.join(differences)})",
             "choose another output folder, or remove it",
         )
-    return dict(found)
+    return dict(record)
 
 
-def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+def keep(path: Path, asked: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
     """Write a result to the cache together with its options, and return the record."""
-    record: dict[str, Any] = plain({"asked": asked, **found})
+    record: dict[str, Any] = plain({"asked": asked, **result})
     make_folder(path.parent)
     with replace_on_success(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -339,8 +339,8 @@ def keep(path: Path, asked: Mapping[str, Any], found: Mapping[str, Any]) -> dict
 
 def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
     """Return a cached result, or measure and cache it; an interrupted run thus continues with what is missing."""
-    found = recall(path, asked)
-    return keep(path, asked, measure()) if found is None else found
+    result = recall(path, asked)
+    return keep(path, asked, measure()) if result is None else result
 
 
 def at_work(

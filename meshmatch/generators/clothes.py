@@ -140,25 +140,25 @@ def _headwear(figure: Figure, verts: Tensor, draw: ClothingDraw) -> Tensor:
     above = step(up, draw.uniform(-1.1, 0.2), 0.12)
     is_long = draw.bernoulli(0.3)  # long hair and hoods reach the neck
     above = torch.maximum(above, is_long * step(up, torch.tensor(-2.2), 0.12))
-    near = (head_share + figure.share[:, part("neck")]).clamp(0, 1)
-    mask = near * step(angle, rim, 6.0) * above * draw.bernoulli(0.7)
+    head_weight = (head_share + figure.share[:, part("neck")]).clamp(0, 1)
+    mask = head_weight * step(angle, rim, 6.0) * above * draw.bernoulli(0.7)
     growth = 1 + draw.log_uniform(0.04, 0.5) * (1 + 0.25 * _folds(figure.skull.expand_as(verts), draw))
     radius = local.norm(dim=-1)
     floor = size[..., 0] * draw.uniform(0.8, 1.15)  # minimum radius: hair makes a skull round
     target = torch.maximum(radius * growth, floor * step(up, torch.tensor(-0.9), 0.8) * draw.bernoulli(0.5))
-    moved = middle + local / radius.clamp_min(1e-6)[..., None] * target[..., None]
+    displaced = middle + local / radius.clamp_min(1e-6)[..., None] * target[..., None]
     # Pointed headwear: move the top up and back.
     tip = draw.bernoulli(0.3) * draw.uniform(0.2, 1.2)
     peak = torch.stack([draw.uniform(-0.2, 0.2), draw.uniform(-0.6, 0.2)], -1)
     from_peak = (across - peak) / draw.uniform(0.25, 0.7)[..., None]
     top = torch.exp(-from_peak.square().sum(-1)) * step(up, torch.tensor(0.0), 1.0)
-    moved = moved + (tip * top)[..., None] * size * torch.nn.functional.normalize(
+    displaced = displaced + (tip * top)[..., None] * size * torch.nn.functional.normalize(
         torch.stack([0 * tip, 1 + 0 * tip, draw.uniform(-0.8, 0.2)], -1), dim=-1
     )
     brim_width = draw.bernoulli(0.12) * draw.uniform(0.2, 0.9)
-    brim = brim_width * torch.exp(-(((up - draw.uniform(0.1, 0.5)) / 0.12) ** 2)) * near
+    brim = brim_width * torch.exp(-(((up - draw.uniform(0.1, 0.5)) / 0.12) ** 2)) * head_weight
     horizontal = local * torch.tensor([1.0, 0.0, 1.0])
-    verts = torch.lerp(verts, moved, mask[..., None])
+    verts = torch.lerp(verts, displaced, mask[..., None])
     return verts + brim[..., None] * horizontal
 
 
@@ -182,7 +182,7 @@ def skirted(
     thighs = [torch.nn.functional.normalize(paths[side][:, 1] - paths[side][:, 0], dim=-1) for side in "LR"]
     legs_parallel = step((thighs[0] * thighs[1]).sum(-1, keepdim=True), torch.tensor(0.6), 0.5)
     reach = figure.reach[:, 1]
-    moved = verts.clone()
+    result = verts.clone()
     wave_height, n_waves = draw.uniform(0, 0.35), torch.randint(2, 7, (draw.B, 1), generator=generator)
     phase = draw.uniform(0, 6.3)
     for side, other in (("L", "R"), ("R", "L")):
@@ -210,10 +210,10 @@ def skirted(
         inner = axis + 0.5 * (other_axis - axis) * inward[..., None] + (r * sheet)[..., None] * ahead
         target = torch.where((cosine > 0)[..., None], outer, inner) + axial
         share = (1 - step(s, hem, 0.05)) * step(s, torch.tensor(0.08), 0.3) * strength * legs_parallel
-        moved[:, at] = torch.lerp(
+        result[:, at] = torch.lerp(
             leg_points, target, share[..., None] * step(leg_share[at], torch.tensor(0.6), 0.6)[..., None]
         )
-    return moved
+    return result
 
 
 def _point_on(path: Float[Tensor, "B K 3"], s: Float[Tensor, " V"]) -> Float[Tensor, "B V 3"]:

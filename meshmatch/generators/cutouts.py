@@ -53,13 +53,13 @@ def region_rig(
 
 def restrict_to_region(rig: Rig, region: Region) -> Rig:
     """The same bodies with only the joints of a region."""
-    kept = [joint for joint, name in enumerate(rig.names) if region.contains(name)]
-    root = kept.index(rig.joint(region.root))
-    weights = rig.weights[:, kept].clone()
+    joints = [joint for joint, name in enumerate(rig.names) if region.contains(name)]
+    root = joints.index(rig.joint(region.root))
+    weights = rig.weights[:, joints].clone()
     weights[:, root] += 1 - weights.sum(1)
-    parents = [kept.index(rig.parents[joint]) if rig.parents[joint] in kept else -1 for joint in kept]
-    names = tuple(rig.names[joint] for joint in kept)
-    return replace(rig, heads=rig.heads[:, kept], weights=weights, parents=tuple(parents), names=names)
+    parents = [joints.index(rig.parents[joint]) if rig.parents[joint] in joints else -1 for joint in joints]
+    names = tuple(rig.names[joint] for joint in joints)
+    return replace(rig, heads=rig.heads[:, joints], weights=weights, parents=tuple(parents), names=names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +196,8 @@ def build_cutout(
 ) -> Cutout:
     """Build the `Cutout` of a part's mean shape that ends at the template's stump, for each of C cuts."""
     along = stump.along(verts)
-    kept = faces[(along[faces] < stump.length).all(1)]
-    keep, corners = np.unique(kept, return_inverse=True)
+    kept_faces = faces[(along[faces] < stump.length).all(1)]
+    keep, corners = np.unique(kept_faces, return_inverse=True)
     faces_kept = corners.reshape(-1, 3)
     first, second = _perpendicular_axes(stump.axis)
     offset = verts[keep] - stump.start

@@ -57,8 +57,10 @@ class RestShape:
         bundled = bundled_template(kind)
         if bundled is not None and np.array_equal(bundled.dense.faces, self.shape.faces):
             return bundled
-        made = make_template(self.shape, kind, self.nodes, labels=self.labels, label_names=self.parts, core=self.core)
-        return replace(made, source=self.source, licence=self.licence)
+        new_template = make_template(
+            self.shape, kind, self.nodes, labels=self.labels, label_names=self.parts, core=self.core
+        )
+        return replace(new_template, source=self.source, licence=self.licence)
 
 
 def bundled_template(kind: str) -> Template | None:

@@ -194,9 +194,9 @@ def overlap(
         balls.append(torch.stack([0.5 * (a + b), b, 0.5 * (b + c), c, 0.5 * (c + end), end], 1))
     total = torch.zeros(len(heads))
     radius = 2 * 0.8 * _RADIUS * skeleton.palm
-    for one in range(5):
-        for other in range(one):
-            gap = torch.cdist(balls[one], balls[other]).flatten(1)
+    for finger_a in range(5):
+        for finger_b in range(finger_a):
+            gap = torch.cdist(balls[finger_a], balls[finger_b]).flatten(1)
             total += (radius - gap).clamp_min(0).sum(1) / skeleton.palm
     return total
 

@@ -171,7 +171,7 @@ class _Reader:
         self._data, self._head, self._bytes_left = data, struct.Struct(head), _MAX_BYTES
 
     def nodes(self, at: int, stop: int, depth: int) -> list[Node]:
-        found: list[Node] = []
+        nodes_read: list[Node] = []
         while at + self._head.size <= stop:
             end, count, length, name = self._head.unpack_from(self._data, at)
             if end == 0:
@@ -181,28 +181,30 @@ class _Reader:
                 raise ValueError("a node that ends nowhere")
             properties = self._properties(start, start + length, count)
             label = self._data[start - name : start].decode()
-            found.append(Node(label, properties, self.nodes(start + length, end, depth + 1)))
+            nodes_read.append(Node(label, properties, self.nodes(start + length, end, depth + 1)))
             at = end
-        return found
+        return nodes_read
 
     def _properties(self, at: int, stop: int, count: int) -> list[Any]:
-        found: list[Any] = []
+        values: list[Any] = []
         for _ in range(count):
             kind, at = chr(self._data[at]), at + 1
             if kind in _SCALARS:
-                found += struct.unpack_from(_SCALARS[kind], self._data, at)
+                values += struct.unpack_from(_SCALARS[kind], self._data, at)
                 at += struct.calcsize(_SCALARS[kind])
             elif kind in "SR":
                 (size,) = struct.unpack_from("<I", self._data, at)
-                found.append(self._data[at + 4 : at + 4 + size])
+                values.append(self._data[at + 4 : at + 4 + size])
                 at += 4 + size
             else:
                 length, packed, size = struct.unpack_from("<III", self._data, at)
-                found.append(self._array(self._data[at + 12 : at + 12 + size], np.dtype(_ARRAYS[kind]), length, packed))
+                values.append(
+                    self._array(self._data[at + 12 : at + 12 + size], np.dtype(_ARRAYS[kind]), length, packed)
+                )
                 at += 12 + size
             if at > stop:
                 raise ValueError("a property that ends nowhere")
-        return found
+        return values
 
     def _array(self, raw: bytes, dtype: np.dtype[Any], length: int, packed: int) -> np.ndarray:
         size = length * dtype.itemsize

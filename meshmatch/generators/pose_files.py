@@ -54,8 +54,8 @@ class GivenPoses:
     def __post_init__(self) -> None:
         vectors = np.asarray(self.vectors)
         if vectors.dtype.kind not in "fiu" or vectors.ndim != 3 or vectors.shape[1:] != (len(self.joints), 3):
-            wanted = f"numbers of (poses, {len(self.joints)} joints, 3)"
-            raise InputError(f"rotations are {vectors.dtype} of {_format_shape(vectors.shape)}, not {wanted}", _HINT)
+            expected = f"numbers of (poses, {len(self.joints)} joints, 3)"
+            raise InputError(f"rotations are {vectors.dtype} of {_format_shape(vectors.shape)}, not {expected}", _HINT)
         if vectors.size == 0:
             raise InputError("there are no poses in it", _HINT)
         if len(set(self.joints)) < len(self.joints):
@@ -83,8 +83,8 @@ class GivenPoses:
         """Index of each joint in a rig; `InputError` if the rig lacks one."""
         unknown = [name for name in self.joints if name not in rig.names]
         if unknown:
-            near = " or ".join(get_close_matches(unknown[0], rig.names, n=3))
-            hint = f"did you mean {near}?" if near else "docs/formats.md names all joints"
+            suggestions = " or ".join(get_close_matches(unknown[0], rig.names, n=3))
+            hint = f"did you mean {suggestions}?" if suggestions else "docs/formats.md names all joints"
             raise InputError(f"the body has no joint {unknown[0][:80]!r}", hint)
         return [rig.joint(name) for name in self.joints]
 
@@ -133,21 +133,21 @@ def load_poses(path: str | Path, share: float = 0.5) -> GivenPoses:
 
 def _read_npz(path: Path) -> tuple[list[Any], Any]:
     """Read arrays `joints` (J,) of strings and `rotations` (P, J, 3)."""
-    found = read_npz(path, ("joints", "rotations"))
-    joints = _entry(found, "joints")
+    arrays = read_npz(path, ("joints", "rotations"))
+    joints = _entry(arrays, "joints")
     if joints.dtype.kind not in "US" or joints.ndim != 1:
         raise ValueError(f"joints are {joints.dtype} of {_format_shape(joints.shape)}, not a list of names")
     if max(joints.nbytes, len(joints)) > _MAX_NAME_BYTES:
         raise ValueError(f"{len(joints)} joints of {joints.dtype} are too many")
-    return joints.astype(np.str_).tolist(), _entry(found, "rotations")
+    return joints.astype(np.str_).tolist(), _entry(arrays, "rotations")
 
 
 def _read_json(path: Path) -> tuple[list[Any], Any]:
     """Read an object with `joints`, a list of names, and `rotations`, nested lists of numbers."""
-    found: Any = read_json(path)
-    if not isinstance(found, dict):
+    record: Any = read_json(path)
+    if not isinstance(record, dict):
         raise ValueError("it is not an object with joints and rotations")
-    joints, rotations = _entry(found, "joints"), _entry(found, "rotations")
+    joints, rotations = _entry(record, "joints"), _entry(record, "rotations")
     if not isinstance(joints, list) or not all(isinstance(word, str) for word in joints):
         raise ValueError("joints are not a list of names")
     try:
@@ -184,10 +184,10 @@ def _read_csv(path: Path) -> tuple[list[Any], Any]:
     return list(joints), vectors
 
 
-def _entry(found: dict[str, Any], name: str) -> Any:
-    if name not in found:
+def _entry(record: dict[str, Any], name: str) -> Any:
+    if name not in record:
         raise ValueError(f"it has no {name}")
-    return found[name]
+    return record[name]
 
 
 def _format_shape(shape: tuple[int, ...]) -> str:

@@ -82,20 +82,20 @@ class AnimalRig:
 
 
 def skinned(
-    rig: AnimalRig, verts: Float[Floats, "V 3"], sizes: Float[Floats, "B 3 3"], angles: Float[Floats, "B 3"]
+    rig: AnimalRig, verts: Float[Floats, "V 3"], scales: Float[Floats, "B 3 3"], angles: Float[Floats, "B 3"]
 ) -> Float[Floats, "V 3"]:
     """Scale and rotate bones, and deform the skin by linear blend skinning; units as in the rig."""
     turns = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     places = rig.joints.copy()
-    moved = np.zeros_like(verts)
-    for bone, above in enumerate(rig.parents):
-        if above >= 0:
-            turns[bone] = turns[above] @ turns[bone]
-            places[bone] = places[above] + turns[above] @ sizes[above] @ (rig.joints[bone] - rig.joints[above])
-        at = rig.weights[:, bone] > 0
-        carried = (verts[at] - rig.joints[bone]) @ (turns[bone] @ sizes[bone]).T + places[bone]
-        moved[at] += rig.weights[at, bone, None] * carried
-    return moved
+    posed = np.zeros_like(verts)
+    for bone, parent in enumerate(rig.parents):
+        if parent >= 0:
+            turns[bone] = turns[parent] @ turns[bone]
+            places[bone] = places[parent] + turns[parent] @ scales[parent] @ (rig.joints[bone] - rig.joints[parent])
+        affected = rig.weights[:, bone] > 0
+        by_bone = (verts[affected] - rig.joints[bone]) @ (turns[bone] @ scales[bone]).T + places[bone]
+        posed[affected] += rig.weights[affected, bone, None] * by_bone
+    return posed
 
 
 def group_of(bone: str) -> str:

@@ -65,11 +65,11 @@ def morphed(rig: AnimalRig, traits: dict[str, float]) -> Float[Floats, "V 3"]:
         across = offset - np.outer(t, axis)
         blend = smooth_step(t, 0.005, 0.045)
         size = max(traits["ear"], 0.12)
-        moved = verts + np.outer((size - 1) * ramp(t, 0.005, 0.045), axis)
-        moved += (blend * (size**0.6 - 1))[:, None] * across
+        scaled = verts + np.outer((size - 1) * ramp(t, 0.005, 0.045), axis)
+        scaled += (blend * (size**0.6 - 1))[:, None] * across
         turn = Rotation.from_euler("z", -side * 70 * traits["ear_out"], degrees=True).as_matrix()
-        turned = (moved - root) @ turn.T + root
-        verts = np.where((t > 0)[:, None], moved + blend[:, None] * (turned - moved), verts)
+        rotated = (scaled - root) @ turn.T + root
+        verts = np.where((t > 0)[:, None], scaled + blend[:, None] * (rotated - scaled), verts)
     trunk = rig.smoothed(rig.share(*_TRUNK) + 0.7 * rig.share(*_LIMBS), 12)
     x, y, z = verts.T
     waist = trunk * np.exp(-(((z + 0.16) / 0.14) ** 2)) * traits["belly"]
@@ -227,8 +227,8 @@ def make_animal(rig: AnimalRig, seed: int, number: int) -> Float[Floats, "V 3"]:
     posed += np.clip(traits["plush"], 0, 1) * (plush(rig, posed) - posed)
     centers = posed[rng.integers(len(posed), size=12)]
     reach = rng.uniform(0.08, 0.25, 12)
-    near = np.exp(-np.square(np.linalg.norm(posed[:, None] - centers, axis=2) / reach))
-    return np.asarray(posed + near @ rng.normal(0, 0.007, (12, 3)))
+    bump_weights = np.exp(-np.square(np.linalg.norm(posed[:, None] - centers, axis=2) / reach))
+    return np.asarray(posed + bump_weights @ rng.normal(0, 0.007, (12, 3)))
 
 
 def resting_animal(rig: AnimalRig) -> Float[Floats, "V 3"]:

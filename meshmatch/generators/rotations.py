@@ -30,7 +30,7 @@ def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Floa
     sine = axis.norm(dim=-1, keepdim=True)
     cosine = (a * b).sum(-1, keepdim=True)
     # For opposite vectors any perpendicular axis is valid.
-    other = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
-    across = normalize(torch.linalg.cross(a, other), dim=-1)
+    any_axis = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
+    across = normalize(torch.linalg.cross(a, any_axis), dim=-1)
     half = (sine < 1e-6) & (cosine < 0)
     return torch.where(half, across * math.pi, axis / sine.clamp_min(1e-9) * torch.atan2(sine, cosine))

@@ -89,14 +89,14 @@ def train_aligner(
             group["lr"] = _RATE * min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1 + np.cos(np.pi * step / steps))
         with device:
             rows = torch.randint(len(points), (_BATCH,), generator=generator)
-            turn = scans.random_rotations(_BATCH, generator)
-        turned = points[rows] @ turn.transpose(1, 2)
-        middle = turned.mean(1, keepdim=True)
+            rotations = scans.random_rotations(_BATCH, generator)
+        rotated = points[rows] @ rotations.transpose(1, 2)
+        middle = rotated.mean(1, keepdim=True)
         with torch.no_grad():
-            features = aligner.features(turned - middle)
+            features = aligner.features(rotated - middle)
         R, t = model.align(features)
-        rotation_error = (R - turn @ rotation[rows]).square().sum((1, 2)).clamp_min(1e-12).sqrt().mean()
-        true_center = (turn @ center[rows][..., None])[..., 0] - middle[:, 0]
+        rotation_error = (R - rotations @ rotation[rows]).square().sum((1, 2)).clamp_min(1e-12).sqrt().mean()
+        true_center = (rotations @ center[rows][..., None])[..., 0] - middle[:, 0]
         loss = rotation_error + 3 * (t - true_center).norm(dim=1).mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -107,19 +107,21 @@ def train_aligner(
         seconds = time.monotonic() - start
         if minutes is not None and seconds > 60 * minutes and step + 1 < steps:
             if checkpoint is not None:
-                words = {"step": str(step + 1), "seconds": f"{seconds_before + seconds:.1f}"}
-                _save(checkpoint, aligner, optimiser, words | {"seed": str(data.seed), "steps": str(steps)})
+                metadata = {"step": str(step + 1), "seconds": f"{seconds_before + seconds:.1f}"}
+                _save(checkpoint, aligner, optimiser, metadata | {"seed": str(data.seed), "steps": str(steps)})
             return Aligned(False, seconds, seconds_before + seconds, float(recent_error))
     seconds = time.monotonic() - start
     return Aligned(True, seconds, seconds_before + seconds, float(recent_error))
 
 
-def _save(path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, words: dict[str, str]) -> None:
+def _save(path: Path, aligner: torch.nn.Module, optimiser: torch.optim.Optimizer, metadata: dict[str, str]) -> None:
     arrays = {f"aligner.{name}": tensor for name, tensor in aligner.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         arrays |= {f"optimiser.{index}.{name}": torch.as_tensor(tensor) for name, tensor in state.items()}
     with replace_on_success(path) as temporary:
-        save_file({name: each.detach().cpu().contiguous().clone() for name, each in arrays.items()}, temporary, words)
+        save_file(
+            {name: each.detach().cpu().contiguous().clone() for name, each in arrays.items()}, temporary, metadata
+        )
 
 
 def _load(
@@ -129,12 +131,12 @@ def _load(
     parts: dict[str, dict[str, Tensor]] = {"aligner": {}}
     try:
         with safe_open(str(path), framework="pt") as file:
-            words = file.metadata() or {}
-            step, seconds = int(words["step"]), float(words["seconds"])
+            metadata = file.metadata() or {}
+            step, seconds = int(metadata["step"]), float(metadata["seconds"])
             for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                 part, _, key = name.rpartition(".") if name.startswith("optimiser.") else name.partition(".")
                 parts.setdefault(part, {})[key] = file.get_tensor(name)
-        if any(words[name] != value for name, value in expected.items()) or not 0 < step < int(expected["steps"]):
+        if any(metadata[name] != value for name, value in expected.items()) or not 0 < step < int(expected["steps"]):
             raise ValueError("of another training")
         aligner.load_state_dict(parts.pop("aligner"))
         state = {int(part.removeprefix("optimiser.")): each for part, each in parts.items()}

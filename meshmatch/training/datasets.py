@@ -157,9 +157,9 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         # The aligner sees the scan centered on its own points, in a random orientation.
         middle = points.mean(1, keepdim=True)
         orientation = scans.random_rotations(B, generator)
-        turned = (points - middle) @ orientation.transpose(1, 2)
+        rotated = (points - middle) @ orientation.transpose(1, 2)
         center = (orientation @ (t - middle[:, 0])[..., None])[..., 0]
-        return Batch(in_core, targets, features, self.aligner.features(turned), orientation @ R, center)
+        return Batch(in_core, targets, features, self.aligner.features(rotated), orientation @ R, center)
 
     def _clutter(
         self, verts: Tensor, areas: Tensor, generator: torch.Generator
@@ -172,10 +172,10 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         B, scan = len(verts), self.scan
         foreign = torch.zeros(B, 1, 1)
         if scan.outside:
-            chosen = torch.rand(B, generator=generator) < scan.outside
+            shows_outside = torch.rand(B, generator=generator) < scan.outside
             # On a GPU it is faster to process all shapes than to wait for the indices of the chosen ones.
-            at = torch.nonzero(chosen)[:, 0] if areas.device.type == "cpu" else torch.arange(B)
-            is_visible = scans.seen_from_outside(verts[at], self.faces, generator) | ~chosen[at, None]
+            at = torch.nonzero(shows_outside)[:, 0] if areas.device.type == "cpu" else torch.arange(B)
+            is_visible = scans.seen_from_outside(verts[at], self.faces, generator) | ~shows_outside[at, None]
             areas = areas.index_copy(0, at, areas[at] * torch.where(is_visible, 1.0, 1e-3))
         if scan.strays:
             foreign = 0.3 * torch.rand(B, 1, 1, generator=generator)
@@ -191,9 +191,9 @@ def _check_shapes(drawn: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"a source must give vertices, not {type(drawn).__name__}", "it returns a tensor") from error
     if verts.ndim != 3 or len(verts) != count or verts.shape[1] < V or verts.shape[2] != 3:
-        wanted = f"({count}, V, 3) with the template's vertices"
+        expected = f"({count}, V, 3) with the template's vertices"
         raise InputError(
-            f"a source must give vertices {wanted}, not {tuple(verts.shape)}", "it is asked for `count` shapes"
+            f"a source must give vertices {expected}, not {tuple(verts.shape)}", "it is asked for `count` shapes"
         )
     if not verts.isfinite().all():
         raise InputError("a source gave vertices that are nan or infinite", "look at the shapes that it draws")
@@ -226,10 +226,10 @@ def build_lattice(samples: ShapeSamples) -> Lattice | None:
     N, P, _ = samples.points.shape
     if N * P > _MAX_POINTS:
         return None
-    known = np.nan_to_num(samples.landmarks)
-    field = _lattice_field(np.concatenate([samples.points.reshape(-1, 3), known.reshape(-1, 3)]).astype(np.float64))
+    landmarks = np.nan_to_num(samples.landmarks)
+    field = _lattice_field(np.concatenate([samples.points.reshape(-1, 3), landmarks.reshape(-1, 3)]).astype(np.float64))
     phi, gradient = field.phi.to_dense(), field.gradient.to_dense()[: 3 * N * P]
-    on_landmarks = phi[N * P :].reshape(N, known.shape[1], field.K)
+    on_landmarks = phi[N * P :].reshape(N, landmarks.shape[1], field.K)
     return Lattice(phi[: N * P].reshape(N, P, -1), gradient.reshape(N, P, 3, -1), on_landmarks)
 
 
@@ -301,24 +301,24 @@ class CloudDataset(torch.utils.data.Dataset[CloudBatch]):
         P = min(self.scan.points, total)
         pick = torch.stack([torch.randperm(total, generator=generator)[:P] for _ in which])
         rows = which[:, None]
-        points, normals, known = self.points[rows, pick], self.normals[rows, pick], self.landmarks[which]
+        points, normals, landmarks = self.points[rows, pick], self.normals[rows, pick], self.landmarks[which]
         B = len(which)
         if self.lattice is not None and self.deform > 0:
             vectors = lattice_vectors(self.deform, B, self.lattice.phi.shape[2], generator)
             points = points + self.lattice.phi[rows, pick] @ vectors
-            known = known + self.lattice.landmark_phi[which] @ vectors
+            landmarks = landmarks + self.lattice.landmark_phi[which] @ vectors
             slopes = self.lattice.gradient[rows, pick] @ vectors[:, None]  # (B, P, k, a): d u_a / d x_k
             normals = deformed_normals(slopes.transpose(-1, -2) + torch.eye(3), normals)
         turn = small_rotations(B, generator)
         size = 1 + self.scan.scale * torch.randn(B, 1, 1, generator=generator).clamp(-2, 2)
         shift = 0.02 * torch.randn(B, 1, 3, generator=generator)
         points = size * points @ turn.transpose(1, 2) + shift
-        known = size * known @ turn.transpose(1, 2) + shift
+        landmarks = size * landmarks @ turn.transpose(1, 2) + shift
         normals = normals @ turn.transpose(1, 2)
         sigma = self.scan.noise * torch.rand(B, 1, 1, generator=generator) ** 3
         points = points + sigma * torch.randn(B, P, 3, generator=generator)
         features = torch.zeros(B, 0) if self.encoder is None else self.encoder.features(points)
-        return CloudBatch(points, normals, known, features)
+        return CloudBatch(points, normals, landmarks, features)
 
 
 def deformed_normals(F: Float[Tensor, "*B 3 3"], normals: Float[Tensor, "*#B 3"]) -> Float[Tensor, "*B 3"]:

@@ -92,8 +92,8 @@ def _load_prepared(shapes: Path, recipe: Recipe) -> TrainingData:
         data, each = f"{len(verts)} registered shapes of {name}", _shape_digests(verts)
         return TrainingData(template, source, "", data, frame, mirror, None, _digest(verts), each, _RESAMPLED)
     samples = read_samples(shapes, template)
-    known = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
-    data = f"{len(samples.points)} shapes of {name}, without correspondence{known}"
+    landmark_note = f" and {len(samples.template_landmarks)} known points" if len(samples.template_landmarks) else ""
+    data = f"{len(samples.points)} shapes of {name}, without correspondence{landmark_note}"
     digest = _digest(samples.points, samples.landmarks)
     return TrainingData(template, samples, "", data, frame, mirror, digest=digest, measured=_RESAMPLED)
 
@@ -154,13 +154,13 @@ def with_validation(shapes: str | Path | RegisteredShapes | None, training_data:
         verts, name = np.asarray(shapes.verts, np.float32), shapes.name
         if shapes.template.hash != training_data.template.hash:
             raise InputError(f"{name}: these are fits of another template", "fit them with the same model")
-        words = f"{len(verts)} fits of {name}"
+        description = f"{len(verts)} fits of {name}"
     else:
         verts, name = read_registered(shapes, training_data.template), as_path(shapes).resolve().name
-        words = f"{len(verts)} registered shapes of {name}"
+        description = f"{len(verts)} registered shapes of {name}"
     if n_shared := len(_shape_digests(verts) & training_data.shape_digests):
         warn(f"{name}: {n_shared} of {len(verts)} validation shapes are also training shapes")
-    return replace(training_data, validation_source=registered_source(torch.from_numpy(verts)), measured=words)
+    return replace(training_data, validation_source=registered_source(torch.from_numpy(verts)), measured=description)
 
 
 def kind_named(name: str) -> Kind | Bodies:

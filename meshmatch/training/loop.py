@@ -111,9 +111,9 @@ class StepReport:
     @property
     def losses(self) -> str:
         """The part of `words` with the losses and the validation error."""
-        words = ", ".join(f"{name} {value:.4g}" for name, value in self.terms.items())
-        known = "" if self.validation is None else f", validation {self.validation:.4f}"
-        return f": {words}{known}"
+        terms = ", ".join(f"{name} {value:.4g}" for name, value in self.terms.items())
+        validation = "" if self.validation is None else f", validation {self.validation:.4f}"
+        return f": {terms}{validation}"
 
 
 def settings_of(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -180,9 +180,9 @@ class Trainer:
             arrays |= {f"optimiser.{index}.{n}": torch.as_tensor(t) for n, t in state.items()}
         arrays = {n: t.detach().cpu().contiguous().clone() for n, t in arrays.items()}
         with replace_on_success(path) as temporary:
-            words = {"step": str(self.step), "seconds": f"{self.seconds:.1f}", "seed": str(self.config.seed)}
-            words |= {"settings": json.dumps(self.settings, default=str), "earlier": json.dumps(self.earlier)}
-            save_file(arrays, temporary, words | {"digest": self.digest})
+            metadata = {"step": str(self.step), "seconds": f"{self.seconds:.1f}", "seed": str(self.config.seed)}
+            metadata |= {"settings": json.dumps(self.settings, default=str), "earlier": json.dumps(self.earlier)}
+            save_file(arrays, temporary, metadata | {"digest": self.digest})
 
     def load(self, path: Path) -> None:
         """Restore the state that `save` wrote; warns of changed settings, which are recorded for the card.
@@ -197,12 +197,12 @@ class Trainer:
         state: dict[int, dict[str, Tensor]] = {}
         try:
             with safe_open(str(path), framework="pt") as file:
-                words = file.metadata() or {}
-                step, seconds = int(words["step"]), float(words.get("seconds", 0.0))
-                seed, digest = int(words.get("seed", self.config.seed)), words.get("digest", "")
+                metadata = file.metadata() or {}
+                step, seconds = int(metadata["step"]), float(metadata.get("seconds", 0.0))
+                seed, digest = int(metadata.get("seed", self.config.seed)), metadata.get("digest", "")
                 saved_settings, earlier = (
-                    json.loads(words.get("settings", "{}")),
-                    json.loads(words.get("earlier", "[]")),
+                    json.loads(metadata.get("settings", "{}")),
+                    json.loads(metadata.get("earlier", "[]")),
                 )
                 if not isinstance(saved_settings, dict) or not isinstance(earlier, list):
                     raise ValueError("no such settings")
@@ -240,16 +240,16 @@ class Trainer:
         self.earlier = earlier
         self._note_changes(saved_settings)
 
-    def _note_changes(self, before: dict[str, Any]) -> None:
+    def _note_changes(self, saved: dict[str, Any]) -> None:
         """Record settings that differ from those of the checkpoint, and warn of them."""
-        now = json.loads(json.dumps(self.settings, default=str))
-        changed = {name: value for name, value in before.items() if name in now and now[name] != value}
+        current = json.loads(json.dumps(self.settings, default=str))
+        changed = {name: value for name, value in saved.items() if name in current and current[name] != value}
         if changed and self.step:
             self.earlier = [*self.earlier, {"until_step": self.step} | changed]
-            words = ", ".join(
-                f"{name.rpartition('.')[2]} {value} is {now[name]} now" for name, value in changed.items()
+            description = ", ".join(
+                f"{name.rpartition('.')[2]} {value} is {current[name]} now" for name, value in changed.items()
             )
-            warn(f"the {self.step:,} steps of the checkpoint had other settings: {words}")
+            warn(f"the {self.step:,} steps of the checkpoint had other settings: {description}")
 
     def run(
         self,
@@ -394,12 +394,12 @@ class Trainer:
     @contextmanager
     def averaged(self) -> Iterator[None]:
         """Context in which the model has the averaged weights."""
-        before = {n: t.detach().clone() for n, t in self.model.state_dict().items()}
+        original = {n: t.detach().clone() for n, t in self.model.state_dict().items()}
         self.model.load_state_dict(self.averaged_state())
         try:
             yield
         finally:
-            self.model.load_state_dict(before)
+            self.model.load_state_dict(original)
 
     def averaged_state(self) -> dict[str, Tensor]:
         """State dict of the model with the averaged weights, on the CPU."""
@@ -410,12 +410,12 @@ class Trainer:
 @contextmanager
 def _matmul_precision(precision: str) -> Iterator[None]:
     """Context with another precision of float32 matrix products; scans are drawn outside it, with full precision."""
-    before = torch.get_float32_matmul_precision()
+    previous = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision(precision)
     try:
         yield
     finally:
-        torch.set_float32_matmul_precision(before)
+        torch.set_float32_matmul_precision(previous)
 
 
 @contextmanager
@@ -426,7 +426,7 @@ def _recorded_signals(wanted: bool = True) -> Iterator[list[int]]:
     terminating = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     active = wanted and threading.current_thread() is threading.main_thread()
     handlers: dict[int, Any] = {
-        each: found for each in terminating if active and callable(found := signal.getsignal(each))
+        signum: current for signum in terminating if active and callable(current := signal.getsignal(signum))
     }
 
     def record(number: int, frame: Any) -> None:

@@ -95,9 +95,9 @@ class CorrespondenceLoss(Objective):
     def __call__(self, model: Deformer, batch: Batch, points: LossPoints, generator: torch.Generator | None) -> Terms:
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
-        moved = points.moved(rows)
-        fit = distance(moved, batch.targets)
-        squared = (moved - batch.targets).square().sum(-1).mean()
+        deformed = points.moved(rows)
+        fit = distance(deformed, batch.targets)
+        squared = (deformed - batch.targets).square().sum(-1).mean()
         terms = {"reconstruction": self.reconstruction * (fit if self.robust else squared)}
         terms |= self._rigidity(points, rows)
         errors = {"error_code": fit.detach()}
@@ -185,18 +185,18 @@ class ChamferLoss(Objective):
         self, rows: Float[Tensor, "B R 3"], batch: CloudBatch, points: SurfacePoints
     ) -> tuple[Terms, Float[Tensor, ""]]:
         """Weighted terms for the decoder's outputs, and the mean distance in both directions."""
-        moved = points.moved(rows)
+        deformed = points.moved(rows)
         F = points.field.deformation_gradient(rows)
         normals = deformed_normals(F.detach(), points.normals)
         share = 0.0 if self.plain else 1.0
-        to_shape, to_template = chamfer(moved, share * normals, batch.points, share * batch.normals)
+        to_shape, to_template = chamfer(deformed, share * normals, batch.points, share * batch.normals)
         penalty = torch.Tensor.float if self.plain else robust
         terms = {"reconstruction": self.reconstruction * (penalty(to_shape).mean() + penalty(to_template).mean())}
         terms |= self.rigidity(F)
-        known = ~batch.landmarks.isnan().any(-1)
-        if self.landmarks and known.any():
+        has_landmark = ~batch.landmarks.isnan().any(-1)
+        if self.landmarks and has_landmark.any():
             placed = points.landmarks + points.landmark_field.displacement(rows)
-            squared = (placed[known] - batch.landmarks[known]).square().sum(-1)
+            squared = (placed[has_landmark] - batch.landmarks[has_landmark]).square().sum(-1)
             terms["landmarks"] = self.landmarks * squared.mean()
         with torch.no_grad():
             fit = 0.5 * ((to_shape + 1e-12).sqrt().mean() + (to_template + 1e-12).sqrt().mean())
@@ -204,26 +204,26 @@ class ChamferLoss(Objective):
 
 
 def chamfer(
-    moved: Float[Tensor, "B M 3"],
+    deformed: Float[Tensor, "B M 3"],
     normals: Float[Tensor, "B M 3"],
     points: Float[Tensor, "B P 3"],
     point_normals: Float[Tensor, "B P 3"],
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B P"]]:
-    """Squared distances of ``moved`` to the nearest of ``points``, and of ``points`` to the nearest of ``moved``.
+    """Squared distances of ``deformed`` to the nearest of ``points``, and of ``points`` to the nearest of ``deformed``.
 
     Nearest points are found by position and weighted normal. The distances are those of positions only, and have gradients
-    with respect to ``moved``.
+    with respect to ``deformed``.
     """
     with torch.no_grad():
-        deformed_features = torch.cat([moved, NORMAL_WEIGHT * normals], -1).float()
+        deformed_features = torch.cat([deformed, NORMAL_WEIGHT * normals], -1).float()
         point_features = torch.cat([points, NORMAL_WEIGHT * point_normals], -1).float()
         nearest_point, nearest_moved = (
             nearest_index(deformed_features, point_features),
             nearest_index(point_features, deformed_features),
         )
     nearest_position = torch.gather(points, 1, nearest_point[..., None].expand(-1, -1, 3))
-    nearest_deformed = torch.gather(moved, 1, nearest_moved[..., None].expand(-1, -1, 3))
-    return (moved - nearest_position).square().sum(-1), (nearest_deformed - points).square().sum(-1)
+    nearest_deformed = torch.gather(deformed, 1, nearest_moved[..., None].expand(-1, -1, 3))
+    return (deformed - nearest_position).square().sum(-1), (nearest_deformed - points).square().sum(-1)
 
 
 def robust(squared: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:

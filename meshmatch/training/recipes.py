@@ -94,17 +94,19 @@ class Recipe:
             A setting is unknown or out of range.
         """
         given = {name: value for name, value in settings.items() if value is not None}
-        wanted = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
-        network = replace(self.network, field=wanted.pop("field", self.network.field))
+        changes = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
+        network = replace(self.network, field=changes.pop("field", self.network.field))
         scan, weights = (
-            {name: wanted.pop(name) for name in names & wanted.keys()} for names in (_SCAN_SETTINGS, _LOSS_SETTINGS)
+            {name: changes.pop(name) for name in names & changes.keys()} for names in (_SCAN_SETTINGS, _LOSS_SETTINGS)
         )
-        train = replace(self.train, loss=wanted.pop("loss", self.train.loss))
+        train = replace(self.train, loss=changes.pop("loss", self.train.loss))
         train = replace(train, loss=with_changes(train.loss, weights))
-        known = {each.name for each in fields(TrainConfig)}
-        if unknown := sorted(wanted.keys() - known):
-            raise OptionError(f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(known))}")
-        return replace(self, network=network, scan=with_changes(self.scan, scan), train=with_changes(train, wanted))
+        train_fields = {each.name for each in fields(TrainConfig)}
+        if unknown := sorted(changes.keys() - train_fields):
+            raise OptionError(
+                f"unknown training setting {unknown[0]!r}", f"choose from {', '.join(sorted(train_fields))}"
+            )
+        return replace(self, network=network, scan=with_changes(self.scan, scan), train=with_changes(train, changes))
 
 
 def default() -> Recipe:
@@ -116,8 +118,8 @@ def default() -> Recipe:
 def people() -> Recipe:
     """Recipe for generated people: half of them naked, half characters; some scans have foreign objects, some lack hidden
     surfaces."""
-    usual = default()
-    return replace(usual, scan=replace(usual.scan, outside=0.2, strays=0.12), characters=0.5)
+    recipe = default()
+    return replace(recipe, scan=replace(recipe.scan, outside=0.2, strays=0.12), characters=0.5)
 
 
 def paper() -> Recipe:
@@ -164,21 +166,21 @@ def paper_clouds() -> Recipe:
 def compact() -> Recipe:
     """Recipe for generated hands and heads: half the network size, half the shapes in a step, and the aligner is trained
     first."""
-    usual = people()
+    recipe = people()
     network = NetworkConfig(code=384, width=512, basis=640, align_basis=384, align_width=384, correct_width=448)
-    train = replace(usual.train, steps=4000, shapes=16, rate=8e-4, align_steps=3000)
-    return replace(usual, network=network, train=train, characters=0.0)
+    train = replace(recipe.train, steps=4000, shapes=16, rate=8e-4, align_steps=3000)
+    return replace(recipe, network=network, train=train, characters=0.0)
 
 
 def going_on(start: TrainedModel) -> Recipe:
     """Recipe for continuing a model's training on shapes that it has fitted: its network and kernel, at a low rate."""
-    usual = people()
-    train = replace(usual.train, steps=1500, rate=1e-4, shapes=16, decay=0.5)
+    recipe = people()
+    train = replace(recipe.train, steps=1500, rate=1e-4, shapes=16, decay=0.5)
     kernel = next(name for name in KERNELS if name == start.card.field["kernel"])
-    known = start.card.recipe.get("scan", {})
-    scan = replace(usual.scan, **{name: bool(known.get(name)) for name in ("upright", "sphere")})
-    usual = replace(usual, scan=scan, characters=0.0)
-    return replace(usual, network=start.inference.config, kernel=kernel, train=train, deform=True)
+    start_scan = start.card.recipe.get("scan", {})
+    scan = replace(recipe.scan, **{name: bool(start_scan.get(name)) for name in ("upright", "sphere")})
+    recipe = replace(recipe, scan=scan, characters=0.0)
+    return replace(recipe, network=start.inference.config, kernel=kernel, train=train, deform=True)
 
 
 def recipe_for(

@@ -25,17 +25,17 @@ class Metrics:
     """
 
     def __init__(self, path: Path, trainer: Trainer) -> None:
-        self.path, self.trainer, kept = path, trainer, []
+        self.path, self.trainer, kept_lines = path, trainer, []
         scores = []
         with suppress(OSError, ValueError, KeyError, TypeError):
             for line in path.read_text(encoding="utf-8").splitlines() if trainer.step else []:
                 row = json.loads(line)
                 if row["step"] <= trainer.step:
-                    kept.append(line)
+                    kept_lines.append(line)
                     scores += [float(row["validation"])] if "validation" in row else []
         self.best = min(scores, default=float("inf"))
         with replace_on_success(path) as temporary:
-            temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+            temporary.write_text("".join(f"{line}\n" for line in kept_lines), encoding="utf-8")
 
     def __call__(self, now: StepReport) -> None:
         record = {"step": now.step, "rate": now.rate, "seconds": round(self.trainer.seconds, 3), **now.terms}

@@ -137,13 +137,13 @@ def seen_from_outside(
     B, cells = len(verts), _CELLS
     centers = verts[:, faces].mean(2)
     views = random_rotations(B * _VIEWS, generator).view(B, _VIEWS, 3, 3)
-    turned = centers[:, None] @ views.transpose(-1, -2)  # B D F 3
-    low, high = turned.amin(2, keepdim=True), turned.amax(2, keepdim=True)
-    at = ((turned - low) / (high - low).amax(-1, keepdim=True) * (cells - 1e-3)).long()
+    rotated = centers[:, None] @ views.transpose(-1, -2)  # B D F 3
+    low, high = rotated.amin(2, keepdim=True), rotated.amax(2, keepdim=True)
+    at = ((rotated - low) / (high - low).amax(-1, keepdim=True) * (cells - 1e-3)).long()
     cell = at[..., 0] * cells + at[..., 1]
     foremost = torch.full((B, _VIEWS, cells * cells), -torch.inf)
-    foremost.scatter_reduce_(2, cell, turned[..., 2], "amax")
-    depth = foremost.gather(2, cell) - turned[..., 2]
+    foremost.scatter_reduce_(2, cell, rotated[..., 2], "amax")
+    depth = foremost.gather(2, cell) - rotated[..., 2]
     return (depth < 0.03).any(1)
 
 

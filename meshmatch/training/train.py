@@ -424,9 +424,9 @@ def build_loss_points(template: Template, kernel: Kernel, model: Deformer, gradi
 
 def build_cloud_dataset(samples: ShapeSamples, config: TrainConfig, scan: ScanConfig) -> CloudDataset:
     """Dataset of batches from a folder's samples, without an encoder."""
-    points, normals, known = map(torch.from_numpy, (samples.points, samples.normals, samples.landmarks))
+    points, normals, landmarks = map(torch.from_numpy, (samples.points, samples.normals, samples.landmarks))
     settings = scan, config.shapes, config.seed, config.steps
-    return CloudDataset(points, normals, known, build_lattice(samples), None, *settings)
+    return CloudDataset(points, normals, landmarks, build_lattice(samples), None, *settings)
 
 
 def build_surface_points(

@@ -108,10 +108,10 @@ def _integer(data: bytes, rng: np.random.Generator) -> bytes:
 
 def _replace_match(pattern: re.Pattern[bytes]) -> Damage:
     def change(data: bytes, rng: np.random.Generator) -> bytes:
-        found = pattern.search(data, _position(data, rng))
-        if found is None:
+        match = pattern.search(data, _position(data, rng))
+        if match is None:
             return _flip(data, rng)
-        return data[: found.start()] + WORDS[int(rng.integers(len(WORDS)))] + data[found.end() :]
+        return data[: match.start()] + WORDS[int(rng.integers(len(WORDS)))] + data[match.end() :]
 
     return change
 
@@ -177,19 +177,19 @@ def _json(data: bytes, rng: np.random.Generator) -> bytes:
     for part in (lambda whole: (whole, bytes), _glb, _tensors):
         try:
             text, put_back = part(data)
-            found = json.loads(text)
+            document = json.loads(text)
         except (ValueError, struct.error, IndexError, RecursionError):
             continue
-        if isinstance(found, dict | list) and found:
+        if isinstance(document, dict | list) and document:
             try:
-                return put_back(json.dumps(_change_value(found, rng)).encode("utf-8", "surrogatepass"))
+                return put_back(json.dumps(_change_value(document, rng)).encode("utf-8", "surrogatepass"))
             except RecursionError:  # nested more than once
                 break
     return _flip(data, rng)
 
 
-def _change_value(found: Any, rng: np.random.Generator) -> Any:
-    inner = found
+def _change_value(document: Any, rng: np.random.Generator) -> Any:
+    inner = document
     while True:
         keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
         key = keys[int(rng.integers(len(keys)))]
@@ -207,7 +207,7 @@ def _change_value(found: Any, rng: np.random.Generator) -> Any:
             inner[key] = [inner[key]]
     else:
         inner[key] = VALUES[int(rng.integers(len(VALUES)))]
-    return found
+    return document
 
 
 def _glb(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:

@@ -131,8 +131,8 @@ def run_batch(samples: Sequence[Sample], seed: int, numbers: range, keep: Path) 
             finally:
                 os._exit(status)  # the forked copy must not run the cleanup of this process
         os.close(write_end)
-        last, found = _listen(read_end, child, remaining.start)
-        failures += found
+        last, new_failures = _listen(read_end, child, remaining.start)
+        failures += new_failures
         remaining = range(last + 1, remaining.stop)
     for failure in failures:
         target = keep / f"{failure.kind}-{failure.family}-{failure.number}"
@@ -186,14 +186,14 @@ def _work(samples: Sequence[Sample], seed: int, numbers: range, out: IO[str]) ->
 
     signal.signal(signal.SIGPROF, on_alarm)
     shape = _shape()
-    with tempfile.TemporaryFile() as printed, tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryFile() as printed, tempfile.TemporaryDirectory() as temporary:
         os.dup2(printed.fileno(), 2)
         sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY_LIMIT, used + _MEMORY_LIMIT))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in numbers:
-            folder = Path(place, str(number))
+            folder = Path(temporary, str(number))
             folder.mkdir()
             sample, path = make_input(samples, seed, number, folder)
             print(json.dumps({"begun": sample.family}), file=out, flush=True)

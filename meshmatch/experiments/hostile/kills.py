@@ -124,8 +124,8 @@ def make_cases(folder: Path, training: bool) -> list[Case]:  # noqa: C901
     def collection(place: Path) -> None:
         (place / "in").mkdir()
         for k in range(3):
-            turned = shape.verts @ (np.eye(3) + 0.05 * np.random.default_rng(k).normal(size=(3, 3)))
-            save_shape(place / "in" / f"s{k}.ply", Shape(turned, shape.faces))
+            verts = shape.verts @ (np.eye(3) + 0.05 * np.random.default_rng(k).normal(size=(3, 3)))
+            save_shape(place / "in" / f"s{k}.ply", Shape(verts, shape.faces))
 
     def all_of(*parts: str) -> Callable[[Path], list[Path]]:
         return lambda place: sorted(path for part in parts for path in (place / part).rglob("*") if path.is_file())
@@ -187,17 +187,17 @@ def kill(case: Case, seed: int, number: int) -> Outcome:
     allowed = {0, -sign, 128 + sign}
     hidden = [] if sign == signal.SIGKILL else _hidden_files(case)
     _quietly(case.folder, ("models", "list"))  # any next command cleans up
-    found = case.outputs()
-    what = f"{case.name} after {sign.name}: status {status}, hidden {hidden}, found {found}, not {case.states}"
+    after_kill = case.outputs()
+    what = f"{case.name} after {sign.name}: status {status}, hidden {hidden}, found {after_kill}, not {case.states}"
     what += f"\n{_output_file(case).read_text(errors='replace')}"
     case.seconds[0] *= 0.85 if status == 0 else 1.03  # adapt, so that most commands are hit
-    if status not in allowed or (hidden and not case.after) or not _old_or_new(case, found):
+    if status not in allowed or (hidden and not case.after) or not _old_or_new(case, after_kill):
         return Outcome("broken", what)
     if case.after:
         _quietly(case.folder, case.after)
         hidden = _hidden_files(case)
         after_state = case.outputs()
-        if hidden or after_state != (case.states[1] if case.after == case.words else found):
+        if hidden or after_state != (case.states[1] if case.after == case.words else after_kill):
             return Outcome("broken", f"{what}; then {' '.join(case.after)} left hidden {hidden}, found {after_state}")
     return Outcome("missed" if status == 0 else "fine")
 
@@ -209,12 +209,10 @@ def fill(case: Case, seed: int, number: int) -> Outcome:
     largest = max(path.stat().st_size for path in case.folder.rglob("*") if path.is_file())
     limit = int(rng.integers(1000, max(2000, largest)))
     status = os.waitstatus_to_exitcode(os.waitpid(_start(case, limit), 0)[1])
-    output, found = _output_file(case).read_text(errors="replace"), case.outputs()
-    what = (
-        f"{case.name} with {limit} bytes a file: status {status}, hidden {_hidden_files(case)}, found {found}\n{output}"
-    )
+    output, outputs = _output_file(case).read_text(errors="replace"), case.outputs()
+    what = f"{case.name} with {limit} bytes a file: status {status}, hidden {_hidden_files(case)}, found {outputs}\n{output}"
     is_proper_error = output.startswith("error: cannot write") and output.count("\n") <= 2
-    if not (status == 0 or (status == 1 and is_proper_error)) or _hidden_files(case) or not _old_or_new(case, found):
+    if not (status == 0 or (status == 1 and is_proper_error)) or _hidden_files(case) or not _old_or_new(case, outputs):
         return Outcome("broken", what)
     return Outcome("missed" if status == 0 else "fine")
 
@@ -224,12 +222,12 @@ def _hidden_files(case: Case) -> list[str]:
     return [path.name for path in case.folder.rglob(".*") if path.name != LOCK]
 
 
-def _old_or_new(case: Case, found: dict[str, str]) -> bool:
+def _old_or_new(case: Case, files: dict[str, str]) -> bool:
     """Whether the files are the old or the new ones; all of the same state, unless the case has `apart`."""
-    if found in case.states:
+    if files in case.states:
         return True
     old, new = case.states
-    return case.apart and all(found.get(name) in (old.get(name), new.get(name)) for name in {*old, *new, *found})
+    return case.apart and all(files.get(name) in (old.get(name), new.get(name)) for name in {*old, *new, *files})
 
 
 def _start(case: Case, limit: int | None = None) -> int:
@@ -241,9 +239,9 @@ def _start(case: Case, limit: int | None = None) -> int:
         return child
     status = 99
     try:
-        with open(_output_file(case), "wb") as said:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
+        with open(_output_file(case), "wb") as output:
+            os.dup2(output.fileno(), 1)
+            os.dup2(output.fileno(), 2)
         for sign in SIGNALS[1:]:
             signal.signal(sign, signal.default_int_handler if sign == signal.SIGINT else signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS[1:])
@@ -270,12 +268,12 @@ def _quietly(place: Path, words: tuple[str, ...]) -> None:
 def _run(place: Path, words: tuple[str, ...]) -> int:
     """Run a command in a folder, with a separate registry and cache."""
     os.environ |= {HOME_VARIABLE: str(place / "home"), "XDG_CACHE_HOME": str(place / "cache")}
-    before = os.getcwd()
+    previous = os.getcwd()
     os.chdir(place)
     try:
         return command(words)
     finally:
-        os.chdir(before)
+        os.chdir(previous)
         sys.stdout.flush()
 
 

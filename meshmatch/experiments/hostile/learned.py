@@ -102,11 +102,11 @@ def learned_samples(folder: Path) -> Iterator[tuple[str, Path, str]]:
     train_implicit(folder / "chair", eggs, config=_IMPLICIT_NETWORK, training=IMPLICIT_TRAINING)
     for model in ("model", "chair"):
         checkpoint = folder / model / CHECKPOINT
-        kept = folder / f"{model}-checkpoint"
-        kept.mkdir()
-        os.replace(checkpoint, kept / f"{model}.safetensors")
+        checkpoint_folder = folder / f"{model}-checkpoint"
+        checkpoint_folder.mkdir()
+        os.replace(checkpoint, checkpoint_folder / f"{model}.safetensors")
         shutil.rmtree(checkpoint.parent)
-        yield "checkpoints", kept, f"{model}.safetensors"
+        yield "checkpoints", checkpoint_folder, f"{model}.safetensors"
     for name in (WEIGHTS, CARD, TEMPLATE):
         yield "models", folder / "model", name
     for name in (WEIGHTS, IMPLICIT):
@@ -122,9 +122,9 @@ def update_hashes(folder: Path) -> None:
     """Update the hashes of damaged weights and templates, as an attacker would; skip files that are too damaged."""
     for card in (folder / CARD, folder / IMPLICIT):
         try:
-            words = json.loads(card.read_bytes())
-            words["weights_sha256"] = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
-            card.write_text(json.dumps(words))
+            metadata = json.loads(card.read_bytes())
+            metadata["weights_sha256"] = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+            card.write_text(json.dumps(metadata))
         except (OSError, ValueError, TypeError, RecursionError):
             continue
     for path in folder.glob("*.safetensors"):
@@ -132,17 +132,17 @@ def update_hashes(folder: Path) -> None:
         size = 8 + int.from_bytes(data[:8], "little")
         try:
             header = json.loads(data[8:size])
-            words = json.loads(header["__metadata__"]["template"])
+            metadata = json.loads(header["__metadata__"]["template"])
             digest = hashlib.sha256()
             for name, kind in (("verts", "<f8"), ("faces", "<i8"), ("nodes", "<f8"), ("radii", "<f8"), ("core", "<i8")):
                 if name == "radii" and name not in header:
-                    array = np.array(float(words["radius"]))
+                    array = np.array(float(metadata["radius"]))
                 else:
                     first, end = (size + int(offset) for offset in header[name]["data_offsets"])
                     array = np.frombuffer(data[first:end], _KINDS[header[name]["dtype"]])
                 digest.update(array.astype(kind).tobytes())
-            words["hash"] = digest.hexdigest()[:16]
-            header["__metadata__"]["template"] = json.dumps(words)
+            metadata["hash"] = digest.hexdigest()[:16]
+            header["__metadata__"]["template"] = json.dumps(metadata)
         except (ValueError, TypeError, LookupError, RecursionError, AttributeError, OverflowError):
             continue
         text = json.dumps(header).encode()

@@ -90,10 +90,10 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
 
 def _load_all(path: Path) -> None:
     shape = load_shape(path)
-    found = []
+    results = []
     for load in (find_appearance, load_coordinates):
         try:
-            found.append(load(path, shape))
+            results.append(load(path, shape))
         except MeshmatchError as error:
             check(error.message, error.hint)
 

@@ -109,8 +109,8 @@ def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
     length = np.linalg.norm(points, axis=1, keepdims=True)
     add("samples", "s.npz", lambda path: np.savez(path, points=points, distances=length[:, 0] - 1))
     add("samples", "s.npz", lambda path: np.savez(path, points=points / length, normals=points / length))
-    for words in (False, True):
-        names = ("arm", "leg", "head") if words else (3, 5, 9)
+    for named in (False, True):
+        names = ("arm", "leg", "head") if named else (3, 5, 9)
         labels = Labels(np.arange(shape.V) % 3, names, "vertices")
         for suffix in LABEL_SUFFIXES:
             add("labels", f"l{suffix}", save_labels, labels, shape)
@@ -179,7 +179,7 @@ def _texts() -> dict[str, bytes]:
     triangles = np.zeros(3, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     triangles["corners"] = places.reshape(3, 3, 3)
     stl = b"COLOR=\xff\0\0\xff".ljust(80, b"\0")
-    found = {
+    texts = {
         "text.ply": head.format("ascii") + faces + "end_header\n" + rows + mixed,
         "strips.ply": head.format("ascii") + strips.format(1) + rows + "8 0 1 2 3 -1 4 5 6\n",
         "rows.ply": head.format("ascii") + strips.format(2) + rows + "4 0 1 2 3\n3 4 5 6\n",
@@ -190,7 +190,7 @@ def _texts() -> dict[str, bytes]:
         "polypaint.obj": re.sub("(?m)^(?=.)", "v ", corner) + "#MRGB " + "ffff0000" * 5 + "\nf 1 2 3 4 5\n",
         "comma.xyz": rows.replace(".", ","), "head.xyz": "//X Y Z R G B\n9\n" + rows.replace("\n", " 1 2 3\n"),
     }  # fmt: skip
-    return {name: text.encode("utf-16" if name == "head.xyz" else "utf-8") for name, text in found.items()} | {
+    return {name: text.encode("utf-16" if name == "head.xyz" else "utf-8") for name, text in texts.items()} | {
         "big.ply": swapped.encode() + places.astype(">f4").tobytes() + big,
         "count.stl": stl + b"\0" * 4 + triangles.tobytes(),
         "tail.stl": stl + np.array(3, "<u4").tobytes() + triangles.tobytes() + b"a tail of other data",
@@ -210,11 +210,11 @@ def _write_scan(path: Path) -> None:
 def _write_textured_ply(path: Path, wedges: bool) -> None:
     """Write a square with texture coordinates of corners or of vertices."""
     path.with_name("a b.png").write_bytes(_image(np.zeros((2, 2, 4), np.uint8), "PNG"))
-    own = "" if wedges else "property float s\nproperty float t\n"
-    more = "property list uchar float texcoord\nproperty int texnumber\n" if wedges else ""
+    vertex_extra = "" if wedges else "property float s\nproperty float t\n"
+    face_extra = "property list uchar float texcoord\nproperty int texnumber\n" if wedges else ""
     path.write_text(
         f"ply\nformat ascii 1.0\ncomment TextureFile A%20b.png\nelement vertex 4\nproperty double x\nproperty double y\n"
-        f"property double z\n{own}element face 2\nproperty list uchar int vertex_indices\n{more}end_header\n"
+        f"property double z\n{vertex_extra}element face 2\nproperty list uchar int vertex_indices\n{face_extra}end_header\n"
         + "".join(f"{x} {y} 0{'' if wedges else f' {x} {y}'}\n" for x in (0, 1) for y in (0, 1))
         + "".join(f"3 {row}{' 6 0 0 1 0 0 1 0' if wedges else ''}\n" for row in ("0 2 1", "1 2 3"))
     )
@@ -233,11 +233,11 @@ def _write_poses(path: Path) -> None:
 
 def _write_apart(path: Path) -> None:
     """Write a gltf whose buffer and image are separate files."""
-    words = _skinned()
-    for part, name in ((words["buffers"][0], "apart.bin"), (words["images"][0], "apart.png")):
+    gltf = _skinned()
+    for part, name in ((gltf["buffers"][0], "apart.bin"), (gltf["images"][0], "apart.png")):
         path.with_name(name).write_bytes(base64.b64decode(part["uri"].partition("base64,")[2]))
         part["uri"] = name
-    path.write_text(json.dumps(words))
+    path.write_text(json.dumps(gltf))
 
 
 def _skinned() -> dict[str, Any]:

@@ -110,8 +110,8 @@ def with_clutter(shape: Shape, length: float, rng: np.random.Generator) -> Shape
     box = trimesh.creation.box(sides).subdivide().subdivide().subdivide()
     rotated = box.vertices @ Rotation.random(random_state=rng).as_matrix().T
     at = int(rng.integers(shape.V))
-    place = shape.verts[at] + 0.5 * sides.max() * shape.vertex_normals[at]
-    verts = np.concatenate([shape.verts, rotated + place])
+    position = shape.verts[at] + 0.5 * sides.max() * shape.vertex_normals[at]
+    verts = np.concatenate([shape.verts, rotated + position])
     return Shape(verts, np.concatenate([shape.faces, box.faces + shape.V]), shape.name)
 
 
@@ -126,11 +126,11 @@ def scan_errors(
     errors: dict[Pair, np.ndarray] = {}
     for pair, map_ in maps.items():
         source, target = (scans[name] for name in pair)
-        known = np.arange(0, target.whole.V, _EVERY)
+        tested_vertices = np.arange(0, target.whole.V, _EVERY)
         is_tested = (source.places >= 0) & (source.places % _EVERY == 0)
         at = np.flatnonzero(is_tested)
         at = at[target.kept[source.places[at]]]
-        rows = TruthDistances(target.whole, known, cache).of(source.places[at] // _EVERY)
+        rows = TruthDistances(target.whole, tested_vertices, cache).of(source.places[at] // _EVERY)
         matched = target.places[map_.index[at]]
         distances = rows[np.arange(len(at)), matched] * (target.whole.area**0.5 / target.length)
         errors[pair] = np.where(matched < 0, 1.0, distances)

@@ -154,5 +154,5 @@ def unseen_bodies(template: Template, count: int, trained: int = 0, seed: int = 
 
     ``trained`` is the seed of that training; 64 identities are drawn with a different one.
     """
-    other = trained + 1 + seed
-    return human_source(template, 64, other)(count, torch.Generator().manual_seed(other)).double().numpy()
+    new_seed = trained + 1 + seed
+    return human_source(template, 64, new_seed)(count, torch.Generator().manual_seed(new_seed)).double().numpy()

@@ -96,8 +96,8 @@ def main(
         true.append(flat(log_stretch(system.deformation_gradient(vectors))))
     seen, truth = (np.stack(each).reshape(people, 2, -1) for each in (fitted, true))
     statistics = statistics_of(seen, truth, components, telling, seed)
-    words = {"model": trained.card.name, "people": str(people), "seed": str(seed)}
-    save_pair_statistics(statistics, output, words)
+    metadata = {"model": trained.card.name, "people": str(people), "seed": str(seed)}
+    save_pair_statistics(statistics, output, metadata)
     rows = [{"people": people, "gain": float(statistics.gains.mean()), "ratio": float(np.median(statistics.ratios))}]
     columns = {"people": "people:d", "mean gain": "gain:.2f", "median ratio": "ratio:.2f"}
     return runner.Report({"rows": rows}, [runner.table("How fits of people differ", rows, columns)])

@@ -121,8 +121,8 @@ def difference(a: Sample, b: Sample, paired: bool = False) -> tuple[float, float
 def bodies_interval(differences: Floats) -> list[float]:
     """95 % interval of the mean of independent numbers, by bootstrap."""
     rng = np.random.default_rng(0)
-    drawn = bootstrap((differences,), np.mean, n_resamples=_DRAWS, method="percentile", rng=rng).confidence_interval
-    return [float(drawn.low), float(drawn.high)]
+    interval = bootstrap((differences,), np.mean, n_resamples=_DRAWS, method="percentile", rng=rng).confidence_interval
+    return [float(interval.low), float(interval.high)]
 
 
 def shapes_interval(differences: Floats, shapes: int) -> list[float]:
@@ -153,26 +153,26 @@ def check_increase(where: str, words: str, samples: Sequence[Sample], paired: bo
 def sample(measured: Measurements, run: Run, where: str, method: str | None = None) -> Sample:
     """Errors of a run on the held-out shapes or on a set."""
     records = measured.records(run, where, method)
-    each = [found["pair_cm"] for found in records if found.get("pair_cm")]
+    each = [record["pair_cm"] for record in records if record.get("pair_cm")]
     shapes = 0 if where == HELD_OUT or not each else (1 + math.isqrt(1 + 4 * len(each[0]))) // 2
-    return Sample([found["mean_cm"] for found in records], each, shapes)
+    return Sample([record["mean_cm"] for record in records], each, shapes)
 
 
 def claims(measured: Measurements, sets: Sequence[str]) -> list[Claim]:
     """All claims, on the held-out shapes and each set; 300 nodes of radius 0.2 beside the best of the other grid points."""
-    results_list = []
+    found_claims = []
     for where in (HELD_OUT, *sets):
-        samples_by_claim = {words: [sample(measured, run, where) for run in runs] for words, runs in CLAIMS}
+        samples_by_claim = {claim_text: [sample(measured, run, where) for run in runs] for claim_text, runs in CLAIMS}
         others = [each for run in GRID if run != BASE and (each := sample(measured, run, where)).seeds]
         best = min(others, key=lambda each: float(np.mean(each.seeds)), default=Sample(()))
         samples_by_claim["300 nodes of radius 0.2 are the best of the grid"] = [sample(measured, BASE, where), best]
         if where != HELD_OUT:
-            for words, hows in _REFINED.items():
-                results_list.append(
-                    check_increase(where, words, [sample(measured, BASE, where, how) for how in hows], paired=True)
+            for claim_text, hows in _REFINED.items():
+                found_claims.append(
+                    check_increase(where, claim_text, [sample(measured, BASE, where, how) for how in hows], paired=True)
                 )
-        results_list += [check_increase(where, words, samples) for words, samples in samples_by_claim.items()]
-    return results_list
+        found_claims += [check_increase(where, claim_text, samples) for claim_text, samples in samples_by_claim.items()]
+    return found_claims
 
 
 def claims_table(claims: Sequence[Claim]) -> Table:
@@ -191,8 +191,8 @@ def number(values: Sequence[float]) -> str:
     """Format the mean, and the standard deviation over several seeds; a dash if there are no values."""
     if not values:
         return "-"
-    words = f"{fmean(values):.2f}"
-    return words if len(values) == 1 else f"{words} ± {stdev(values):.2f}"
+    text = f"{fmean(values):.2f}"
+    return text if len(values) == 1 else f"{text} ± {stdev(values):.2f}"
 
 
 def percent(values: Sequence[float]) -> str:
@@ -256,11 +256,11 @@ def cost_of(measured: Measurements, field: str, constraint: str) -> float | None
 
 def tables(measured: Measurements, views: Sequence[str], sets: Sequence[str], budget: str) -> list[Table]:
     """Tables of the given views; of table 4 only the halves that were measured."""
-    found = []
+    result = []
     for name in views:
         view = VIEWS[name]
         if name != "table4" or any(run in measured.trained for run in view.runs):
-            found.append(errors_table(view, measured, sets, budget))
+            result.append(errors_table(view, measured, sets, budget))
         if name == "table4" and measured.times:
-            found.append(cost_table(measured))
-    return found
+            result.append(cost_table(measured))
+    return result

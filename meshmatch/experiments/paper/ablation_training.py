@@ -302,13 +302,13 @@ def keep_first_points(points: LossPoints, supervised: int) -> LossPoints:
 
 def build_trainer(setting: Setting, run: Run) -> tuple[Trainer, list[Any]]:
     """Build a trainer at its first step, and batches for it."""
-    chosen, template, source = setting.recipe(run), setting.template(run), setting.sources(run.pose)[0]
-    train = chosen.train
-    model = build_deformer(template, source, chosen.network, chosen.scan, chosen.kernel, train.seed)
-    points = build_loss_points(template, chosen.kernel, model, gradients=N_GRADIENT_POINTS)
+    recipe, template, source = setting.recipe(run), setting.template(run), setting.sources(run.pose)[0]
+    train = recipe.train
+    model = build_deformer(template, source, recipe.network, recipe.scan, recipe.kernel, train.seed)
+    points = build_loss_points(template, recipe.kernel, model, gradients=N_GRADIENT_POINTS)
     trainer = Trainer(model, keep_first_points(points, run.supervised), train)
     data = build_dataset(
-        template, source, model, chosen.scan, train.shapes, train.scans_per_shape, train.seed, _BATCHES
+        template, source, model, recipe.scan, train.shapes, train.scans_per_shape, train.seed, _BATCHES
     )
     trainer.model.train()
     batches = [data[number].to(trainer.device) for number in range(_BATCHES)]

@@ -134,8 +134,8 @@ GRID = tuple(replace(BASE, nodes=K, radius=r) for K, r in _PAPER6)
 def _numbers(name: str, counts: Sequence[int]) -> tuple[Row, ...]:
     """Rows of ours and of 3D-CODED for several values of a setting; both see the same number of scans."""
     return tuple(
-        Row((str(count), words), replace(run, **{name: count}))  # type: ignore[arg-type]
-        for words, run in (("ours", BASE), ("3D-CODED", CODED))
+        Row((str(count), label), replace(run, **{name: count}))  # type: ignore[arg-type]
+        for label, run in (("ours", BASE), ("3D-CODED", CODED))
         for count in counts
     )
 

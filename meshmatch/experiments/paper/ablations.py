@@ -241,9 +241,9 @@ def main(
     runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
     benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
     setting, measure = Setting(threads, batch, loss), Measure(shapes=shapes, code_steps=code_steps)
-    wanted = runner.names_of(methods, METHODS, "method")
+    method_names = runner.names_of(methods, METHODS, "method")
     earlier = saved_rows(rows) if rows else {}
-    study = Study(output, setting, measure, steps, model, benches, cache, show, wanted, earlier)
+    study = Study(output, setting, measure, steps, model, benches, cache, show, method_names, earlier)
     measured = study.measure_all(runs, names, rounds)
     set_names = [bench.name for bench in benches]
     tested_claims = claims(measured, set_names)

@@ -46,9 +46,9 @@ def energies(model: Any, run: Run, setting: Setting) -> dict[str, float]:
     return means
 
 
-def row_of(words: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def row_of(label: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Row of the table: means over seeds, with standard deviations."""
-    row: dict[str, Any] = {"weights": words, "steps": runs[0]["steps"]}
+    row: dict[str, Any] = {"weights": label, "steps": runs[0]["steps"]}
     for name in runs[0]:
         if name.startswith(("held", "volume", "rigidity")):
             values = [each[name] for each in runs]
@@ -68,8 +68,8 @@ def main(
     results: dict[str, list[dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = work or Path(temporary)
-        for words, constraint in WEIGHTS.items():
-            results[words] = []
+        for label, constraint in WEIGHTS.items():
+            results[label] = []
             for seed in range(seeds):
                 run = replace(BASE, constraint=constraint, seed=seed)
 
@@ -79,6 +79,6 @@ def main(
                     return {**trained, **energies(as_model(folder / run.name / "model"), run, setting)}
 
                 asked = {"run": asdict(run), "setting": asdict(setting), "steps": steps}
-                results[words].append(runner.once(folder / run.name / "measured.json", asked, measure))
-            rows.append(row_of(words, results[words]))
+                results[label].append(runner.once(folder / run.name / "measured.json", asked, measure))
+            rows.append(row_of(label, results[label]))
     return runner.Report({"rows": results}, [runner.table("Energies of blended codes", rows, _COLUMNS)])

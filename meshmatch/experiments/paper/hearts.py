@@ -71,9 +71,9 @@ def main(
 ) -> runner.Report:
     all_shapes, truth = load_folder(data / HEART, TRUTH)
     shapes = {name: all_shapes[name] for name in (SOURCE, *TARGETS)}
-    known = {name: truth[name][:, 1] for name in shapes}
+    known_chambers = {name: truth[name][:, 1] for name in shapes}
     rows: list[dict[str, Any]] = []
-    picture_rows = [row_of_hearts("truth", shapes, known)]
+    picture_rows = [row_of_hearts("truth", shapes, known_chambers)]
     with TemporaryDirectory() as temporary:
         folder = work or Path(temporary)
         make_folder(folder)
@@ -87,8 +87,8 @@ def main(
                 (each, SOURCE): method.map(shapes[each], fits[each], shapes[SOURCE], fits[SOURCE]) for each in TARGETS
             }
             rows.append({"method": name, **heart_errors(shapes, truth, maps)})
-            transferred = {each: known[SOURCE][maps[each, SOURCE].index] for each in TARGETS}
-            picture_rows.append(row_of_hearts(name, shapes, known | transferred))
+            transferred = {each: known_chambers[SOURCE][maps[each, SOURCE].index] for each in TARGETS}
+            picture_rows.append(row_of_hearts(name, shapes, known_chambers | transferred))
     if picture is not None:
         sheet = Image.new("RGB", (picture_rows[0].width, sum(row.height for row in picture_rows)), "white")
         for number, row in enumerate(picture_rows):
