@@ -97,7 +97,7 @@ class Figure:
         return torch.stack(part_axes, 1)
 
     def smooth(self, values: Float[Tensor, "B V C"], rounds: int) -> Float[Tensor, "B V C"]:
-        """Move vertex values halfway to the mean of their neighbors, ``rounds`` times."""
+        """Move vertex values halfway to the mean of their neighbours, ``rounds`` times."""
         flat = values.transpose(0, 1).flatten(1)
         for _ in range(rounds):
             flat = 0.5 * flat + 0.5 * self._means(flat)

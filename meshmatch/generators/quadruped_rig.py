@@ -71,7 +71,7 @@ class AnimalRig:
         return np.asarray(along / size) if size > 1e-9 else np.array([0.0, -1.0, 0.0])
 
     def smoothed(self, values: Floats, rounds: int) -> Floats:
-        """Vertex values after ``rounds`` steps halfway to the mean of their neighbors."""
+        """Vertex values after ``rounds`` steps halfway to the mean of their neighbours."""
         for _ in range(rounds):
             values = 0.5 * values + 0.5 * (self._neighbours @ values)
         return values
@@ -141,7 +141,7 @@ def save_rig(rig: AnimalRig, path: Path, **words: str) -> None:
 
 
 def mean_of_neighbours(faces: Int[Ints, "M 3"], count: int) -> csr_matrix:
-    """Sparse (count, count) matrix that averages vertex values over each vertex's neighbors."""
+    """Sparse (count, count) matrix that averages vertex values over each vertex's neighbours."""
     edges = edges_of(faces).vertices
     a, b = np.concatenate([edges, edges[:, ::-1]]).T
     adjacency = coo_matrix((np.ones(len(a)), (a, b)), (count, count)).tocsr()

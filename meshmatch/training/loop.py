@@ -33,10 +33,8 @@ from meshmatch.training.losses import CorrespondenceLoss, Objective
 
 OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
 """Settings that depend on the machine; they are not read from a recipe."""
-_TEMPLATE_BUFFERS = (
-    "nodes",
-    "anchors",
-)  # buffers that must be equal in a checkpoint and the training that resumes from it
+# Buffers that must be equal in a checkpoint and the training that resumes from it.
+_TEMPLATE_BUFFERS = ("nodes", "anchors")
 _MOMENTS, _STEP_SHAPE = ("exp_avg", "exp_avg_sq"), {"step": torch.Size()}  # Adam's state of each parameter
 
 
@@ -148,9 +146,8 @@ class Trainer:
     ) -> None:
         self.config, self.digest = config, digest  # digest of the shapes, see `TrainingData`; empty if unknown
         self.settings: dict[str, Any] = settings_of(recipe or asdict(config)) | {"processes": processes()}
-        self.earlier: list[
-            dict[str, Any]
-        ] = []  # earlier settings that differed, each with the step until which they applied
+        # Earlier settings that differed, each with the step until which they applied.
+        self.earlier: list[dict[str, Any]] = []
         self.rank = int(os.environ.get("RANK", 0))
         self.world = processes()
         self.device = training_device(int(os.environ.get("LOCAL_RANK", 0)), config.device)
@@ -163,9 +160,8 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(model.parameters(), config.rate, **settings)
         self.loss: Any = torch.compile(config.loss) if config.compile else config.loss
         self.step, self.seconds = 0, 0.0
-        self._unchecked: tuple[dict[str, Tensor], int] | None = (
-            None  # loss terms and step, not yet checked to be finite
-        )
+        # Loss terms and their step, not yet checked to be finite.
+        self._unchecked: tuple[dict[str, Tensor], int] | None = None
         self._signals: list[int] = []  # termination signals that this one of several processes received
         self._stop_requested = False  # whether any process received one
 
@@ -200,11 +196,8 @@ class Trainer:
                 metadata = file.metadata() or {}
                 step, seconds = int(metadata["step"]), float(metadata.get("seconds", 0.0))
                 seed, digest = int(metadata.get("seed", self.config.seed)), metadata.get("digest", "")
-                saved_settings, earlier = (
-                    json.loads(metadata.get("settings", "{}")),
-                    json.loads(metadata.get("earlier", "[]")),
-                )
-                if not isinstance(saved_settings, dict) or not isinstance(earlier, list):
+                saved, earlier = json.loads(metadata.get("settings", "{}")), json.loads(metadata.get("earlier", "[]"))
+                if not isinstance(saved, dict) or not isinstance(earlier, list):
                     raise ValueError("no such settings")
                 for name in file.keys():  # noqa: SIM118 (it is no dictionary)
                     part, _, key = name.partition(".")
@@ -238,7 +231,7 @@ class Trainer:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.earlier = earlier
-        self._note_changes(saved_settings)
+        self._note_changes(saved)
 
     def _note_changes(self, saved: dict[str, Any]) -> None:
         """Record settings that differ from those of the checkpoint, and warn of them."""
@@ -286,9 +279,8 @@ class Trainer:
                         terms = self.iterate(batch)
                         can_save = True
                     for name, value in terms.items():
-                        sums[name] = (
-                            sums.get(name, 0.0) + value.detach().float()
-                        )  # stays on the device, so that no step waits for it
+                        # The sums stay on the device, so that no step waits for them.
+                        sums[name] = sums.get(name, 0.0) + value.detach().float()
                     n_summed += 1
                     now = time.monotonic()
                     self.seconds = seconds_before + now - start

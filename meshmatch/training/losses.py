@@ -101,7 +101,7 @@ class CorrespondenceLoss(Objective):
         terms = {"reconstruction": self.reconstruction * (fit if self.robust else squared)}
         terms |= self._rigidity(points, rows)
         errors = {"error_code": fit.detach()}
-        # Blend scans half a batch apart: neighbors are scans of the same shape, whose blends have nothing to teach.
+        # Blend scans half a batch apart: neighbours are scans of the same shape, whose blends have nothing to teach.
         terms |= self.between(model, code, max(1, len(code) // 2), points, generator)
         if model.corrector is not None:
             scan = batch.points[:, : self.correct_points]
@@ -167,7 +167,7 @@ class ChamferLoss(Objective):
         code = model.encoder(batch.encode_features)
         rows = model.decoder(code)
         terms, fit = self._energies(rows, batch, points)
-        # Neighbors in a batch are different shapes: each is drawn once before any is repeated.
+        # Neighbours in a batch are different shapes: each is drawn once before any is repeated.
         terms |= self.between(model, code, 1, points, generator)
         if model.corrector is not None:
             current = rows.detach()

@@ -101,7 +101,7 @@ def yaw_rotations(B: int, generator: torch.Generator) -> Float[Tensor, "B 3 3"]:
 
 
 def bump(verts: Float[Tensor, "B V 3"], amplitude: float, generator: torch.Generator) -> Float[Tensor, "B V 3"]:
-    """Add a smooth random displacement, such as from clothes, soft tissue or modeling style; amplitude in sqrt(area)."""
+    """Add a smooth random displacement, such as from clothes, soft tissue or modelling style; amplitude in sqrt(area)."""
     B = len(verts)
     size = amplitude * torch.rand(B, 1, 1, generator=generator)
     for frequency in (8.0, 20.0):

@@ -150,9 +150,8 @@ def train(
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
         facts, recipe = fill_from_card(facts, start.card), recipe or going_on(start)
     if start is not None:
-        check_start(
-            start, template_of(shapes, kind, recipe, start), recipe
-        )  # before shapes are made, which takes minutes
+        # Check this before shapes are made, which may take minutes.
+        check_start(start, template_of(shapes, kind, recipe, start), recipe)
 
     if tensorboard:
         check_curves()
@@ -208,9 +207,7 @@ def train_model(
     _build_card(template, recipe, facts, record)  # fail now, not at the end, if a card cannot hold the facts
     make_folder(checkpoint.parent)
     config, kernel = recipe.train, recipe.kernel
-    if (
-        recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere"
-    ):  # the paper's loss is in units of the sphere
+    if recipe.scan.sphere and getattr(source, "scale", "sphere") == "sphere":  # the paper's units of length
         reconstruction = config.loss.reconstruction / template_radius(template) ** 2
         config = replace(config, loss=replace(config.loss, reconstruction=reconstruction))
     points: Any
@@ -307,12 +304,8 @@ def export(trainer: Trainer, template: Template, output: Path, recipe: Recipe, f
     history |= {"processes": trainer.world} if trainer.world > 1 else {}
     settings = recipe_record(recipe) | {name: value for name, value in history.items() if value}
     if isinstance(facts.start, TrainedModel):
-        start_card = facts.start.card
-        settings["start"] = {
-            "model": start_card.name,
-            "weights_sha256": start_card.weights_sha256,
-            "steps": start_card.steps,
-        }
+        origin = facts.start.card
+        settings["start"] = {"model": origin.name, "weights_sha256": origin.weights_sha256, "steps": origin.steps}
     card = replace(
         _build_card(template, recipe, facts, settings), steps=trainer.step, training_minutes=round(trainer.seconds / 60, 1),
         metrics={"validation": {"distance": round(score, 5)}}, weights_sha256=digest,
@@ -339,7 +332,7 @@ def fill_basis(points: Float[Tensor, "B P 3"], M: int, generator: torch.Generato
     flat = points.flatten(0, 1)
     flat = flat[torch.randperm(len(flat), generator=generator)[:20_000]]
     jittered = flat + 0.06 * torch.randn(len(flat), 3, generator=generator)
-    # Farthest point sampling favors outliers: drop the outermost points first.
+    # Farthest point sampling favours outliers: drop the outermost points first.
     jittered = jittered[jittered.norm(dim=1) < torch.quantile(jittered.norm(dim=1), 0.995)]
     return jittered[torch.from_numpy(farthest_points(jittered.double().numpy(), M))]
 

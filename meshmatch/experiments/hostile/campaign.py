@@ -28,9 +28,8 @@ from meshmatch.experiments.hostile import inputs, kills
 from meshmatch.experiments.hostile.samples import make_samples
 from meshmatch.outputs import make_folder, replace_on_success
 
-_FULL_DISK_EVERY = (
-    9  # every 9th command runs on a full disk instead of being killed; 9 does not divide the number of cases
-)
+# Every 9th command runs on a full disk instead of being killed; 9 does not divide the number of cases.
+_FULL_DISK_EVERY = 9
 _FULL_DISK = ", disk full"
 _COLUMNS = {"family": "family", "tried": "tried:,d", **{kind: f"{kind}:d" for kind in inputs.KINDS}}
 _KILL_COLUMNS = {

@@ -35,10 +35,11 @@ SECONDS = 20.0
 BATCH = 200  # inputs per process
 # Files with hashes, which an attacker would adapt to the damage.
 _SIGNED = ("models", "implicit models", "templates")
+# Changes that other systems make to the names of accompanying files.
 _NAMES: tuple[Callable[[str], str], ...] = (
     *(str.swapcase, str.upper, lambda name: name.replace(" ", "%20"), lambda name: f"textures\\{name}"),
     *(partial(unicodedata.normalize, form) for form in ("NFC", "NFD")),
-)  # changes that other systems make to the names of accompanying files
+)
 _PATIENCE = 300.0  # seconds of wall time, against readers that sleep or ignore the signal
 _MEMORY_LIMIT = 1 << 30  # bytes, in addition to the memory of the process at its start
 

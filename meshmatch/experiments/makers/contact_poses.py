@@ -23,16 +23,13 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_normals
 
 _STEPS, _EVERY, _RATE = 240, 6, 2.5  # Adam: steps, steps between two searches for contacts, rate in degrees
-_MIN_REST_DISTANCE = 0.15  # metres: points of the skin that are farther apart at rest are not neighbors
-_N_NEAREST = 40  # nearest vertices that are searched for one that is not a neighbor
+_MIN_REST_DISTANCE = 0.15  # metres: points of the skin that are farther apart at rest are not neighbours
+_N_NEAREST = 40  # nearest vertices that are searched for one that is not a neighbour
 _MAX_DEPTH = 0.06  # metres: points that are deeper inside came in from another side
 _TOUCH_DISTANCE = 0.015  # metres between vertices of touching parts
 _SKIN_YIELD = 0.004  # metres of penetration that are not penalised
-_TOUCH, _SOFT, _STAY = (
-    100.0,
-    300.0,
-    2e-5,
-)  # weights of contact and penetration (square metres), deviation (square degrees)
+# Weights of contact and penetration (square metres), and of the deviation from the initial angles (square degrees).
+_TOUCH, _SOFT, _STAY = 100.0, 300.0, 2e-5
 _HAND = 0.03  # metres from the palm to the back of a hand
 _SPINE = {"spine05": 0.15, "spine04": 0.25, "spine03": 0.2, "spine02": 0.2, "spine01": 0.2}
 _NECK = {"neck01": 0.3, "neck02": 0.2, "neck03": 0.2, "head": 0.3}
@@ -155,7 +152,7 @@ def _contacts(poses: Sequence[ContactPose], points: Mapping[str, int]) -> tuple[
 
 
 def _near_contacts(verts: Float[Tensor, "B V 3"], rest: Float[Tensor, "B V 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices of bodies and vertices with `far_neighbours`, and these neighbors."""
+    """Indices of bodies and vertices with `far_neighbours`, and these neighbours."""
     neighbours = [
         far_neighbours(_array(posed_verts), _array(rest_verts))
         for posed_verts, rest_verts in zip(verts, rest, strict=True)

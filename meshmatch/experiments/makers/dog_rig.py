@@ -107,7 +107,7 @@ def _eyes_and_tongue(verts: Float[Floats, "N 3"]) -> Bool[Bools, " N"]:
 
 
 def harmonic(verts: Float[Floats, "N 3"], faces: Int[Ints, "M 3"], free: Bool[Bools, " N"]) -> Float[Floats, "N 3"]:
-    """Harmonic interpolation: free vertices move to the mean of their neighbors, all others are fixed."""
+    """Harmonic interpolation: free vertices move to the mean of their neighbours, all others are fixed."""
     if not free.any():
         return verts
     laplacian = (diags(np.ones(len(verts))) - mean_of_neighbours(faces, len(verts))).tocsr()

@@ -1,7 +1,7 @@
 """Effect on blends of codes of the weights in the paper's table 3, which are for interpolation.
 
 Small networks (`ablation_training`) are trained from scratch without regularisers, with the weights of table 1 and with
-those of table 3. They encode held-out bodies. At the codes, and halfway between those of neighbors in a batch, the
+those of table 3. They encode held-out bodies. At the codes, and halfway between those of neighbours in a batch, the
 unweighted energies of the deformation gradient F are computed: (det F - 1)^2 for volume, |F^T F - I| for rigidity, as means
 over the template. Bodies themselves have positive energies, as they differ from the template: a blend is better than its
 ends if its energies are lower. Held out is the mean distance of the template's points from their correct places, in cm at
@@ -35,7 +35,7 @@ _COLUMNS |= {f"{name}, {where}": f"{name}_{key}:>" for name in ("volume", "rigid
 
 @torch.no_grad()
 def energies(model: Any, run: Run, setting: Setting) -> dict[str, float]:
-    """Mean energies at the codes of held-out bodies, and halfway between those of neighbors in the batch."""
+    """Mean energies at the codes of held-out bodies, and halfway between those of neighbours in the batch."""
     network = model.network.eval()
     points = build_loss_points(model.template, setting.recipe(run).kernel, network, gradients=N_GRADIENT_POINTS)
     code = network.encoder(pool_of(setting, run.pose).held_out.encode_features)
