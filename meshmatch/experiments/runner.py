@@ -144,7 +144,7 @@ def _without_save(words: Sequence[str]) -> list[str]:
 def saved_record(metadata: Mapping[str, Any], commands: Sequence[str], report: Report) -> dict[str, Any]:
     """Contents of a file of results: metadata, ``commands``, ``data``, ``tables`` as text and ``values`` as numbers."""
     data = metadata["options"].get("data", "generated")
-    tables = [{"title": str(each.title), **dict(zip(("columns", "rows"), words_of(each), strict=True))}
+    tables = [{"title": str(each.title), **dict(zip(("columns", "rows"), table_cells(each), strict=True))}
               for each in report.tables]  # fmt: skip
     return {**metadata, "commands": list(commands), "data": data, "tables": tables, "values": plain(report.record)}
 
@@ -245,7 +245,7 @@ def _cell(row: Mapping[str, Any], key: str, form: str) -> str:
     return format(value, form).replace("%", " %") if form != ">" else str(value)
 
 
-def words_of(table: Table) -> tuple[list[str], list[list[str]]]:
+def table_cells(table: Table) -> tuple[list[str], list[list[str]]]:
     """Columns and rows of a table as strings."""
     rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
     return [str(column.header) for column in table.columns], [list(row) for row in rows]
@@ -286,7 +286,7 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
+def read_cached(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read a cached result; None if there is no file.
 
     Raises
@@ -302,10 +302,10 @@ def recall(path: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         record = None
-    return as_asked(record, asked, str(path))
+    return check_cached(record, asked, str(path))
 
 
-def as_asked(record: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]:
+def check_cached(record: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Check a cached result; ``where`` names its origin in messages.
 
     Raises
@@ -328,7 +328,7 @@ def as_asked(record: Any, asked: Mapping[str, Any], where: str) -> dict[str, Any
     return dict(record)
 
 
-def keep(path: Path, asked: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
+def write_cached(path: Path, asked: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
     """Write a result to the cache together with its options, and return the record."""
     record: dict[str, Any] = plain({"asked": asked, **result})
     make_folder(path.parent)
@@ -339,8 +339,8 @@ def keep(path: Path, asked: Mapping[str, Any], result: Mapping[str, Any]) -> dic
 
 def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
     """Return a cached result, or measure and cache it; an interrupted run thus continues with what is missing."""
-    result = recall(path, asked)
-    return keep(path, asked, measure()) if result is None else result
+    result = read_cached(path, asked)
+    return write_cached(path, asked, measure()) if result is None else result
 
 
 def at_work(

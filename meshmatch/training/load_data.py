@@ -111,7 +111,7 @@ def _shape_digests(verts: np.ndarray) -> frozenset[str]:
     return frozenset(_digest(each) for each in verts)
 
 
-def template_of(
+def known_template(
     shapes: str | Path | RegisteredShapes | None, kind: Kind | Bodies | None, recipe: Recipe, start: TrainedModel
 ) -> Template | None:
     """The template that `load_training_data` will return, without making any shapes.
@@ -163,7 +163,7 @@ def with_validation(shapes: str | Path | RegisteredShapes | None, training_data:
     return replace(training_data, validation_source=registered_source(torch.from_numpy(verts)), measured=description)
 
 
-def kind_named(name: str) -> Kind | Bodies:
+def default_kind(name: str) -> Kind | Bodies:
     """Default generator settings of a kind; `OptionError` if its name is unknown."""
     return Bodies() if name == "human" else Kind(name)
 

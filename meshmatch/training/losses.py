@@ -21,8 +21,8 @@ from meshmatch.training.datasets import Batch, CloudBatch, OnDevice, deformed_no
 
 Terms = dict[str, Tensor]
 NORMAL_WEIGHT = 0.15
-"""Weight of normals in the search for nearest points: distance of two points for a unit difference of their normals, in
-units of sqrt(area); set by hand."""
+"""Weight of normals in the search for nearest points: the distance that a unit difference of normals counts as, in units of
+sqrt(area); set by hand."""
 _ROBUST = 0.25  # scale of the robust loss, units of sqrt(area): it saturates at larger distances; set by hand
 
 

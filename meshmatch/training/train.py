@@ -46,9 +46,9 @@ from meshmatch.training.facts import fill_from_card
 from meshmatch.training.load_data import (
     TrainingData,
     check_start,
-    kind_named,
+    default_kind,
+    known_template,
     load_training_data,
-    template_of,
     with_validation,
 )
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
@@ -102,13 +102,13 @@ def train(
         Resume from a checkpoint if there is one.
     validation
         Registered shapes for validation, excluded from training: a folder prepared with the same template, or fits as
-        for ``shapes``. By default a batch drawn from the training shapes.
+        for ``shapes``. By default another batch is drawn as in training.
     tensorboard
         Also write curves for TensorBoard (the extra ``tensorboard``), into the folder ``tensorboard``.
     progress
         As in `match`.
     report
-        Called with losses and validation error every 50 steps.
+        Called with the losses every 50 steps, and with the validation error every 500.
 
     Returns
     -------
@@ -135,7 +135,7 @@ def train(
     """
     output, facts = Path(output), facts or CardFacts()
     facts = replace(facts, name=check_name(facts.name or output.resolve().name))
-    kind = kind_named(kind) if isinstance(kind, str) else kind
+    kind = default_kind(kind) if isinstance(kind, str) else kind
     source_model = shapes.model if isinstance(shapes, RegisteredShapes) and shapes.model != NO_MODEL else None
     start = facts.start or source_model
     start = load_model(start) if isinstance(start, str | Path) else start
@@ -151,7 +151,7 @@ def train(
         facts, recipe = fill_from_card(facts, start.card), recipe or going_on(start)
     if start is not None:
         # Check this before shapes are made, which may take minutes.
-        check_start(start, template_of(shapes, kind, recipe, start), recipe)
+        check_start(start, known_template(shapes, kind, recipe, start), recipe)
 
     if tensorboard:
         check_curves()

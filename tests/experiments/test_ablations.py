@@ -37,7 +37,7 @@ from meshmatch.experiments.paper.ablation_training import (
     train_run,
 )
 from meshmatch.experiments.paper.ablation_views import BASE, CODED, CONSTRAINTS, TABLE3, VIEWS, Run, all_runs
-from meshmatch.experiments.runner import words_of
+from meshmatch.experiments.runner import table_cells
 from meshmatch.fields.shape_functions import FIELDS
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.fitting.solve.system import node_system
@@ -229,7 +229,7 @@ def test_a_claim_needs_an_interval_beside_zero(errors: tuple[list[float], ...], 
 def test_a_claim_that_nobody_measured_has_no_row() -> None:
     there = Sample([1.0, 1.1]), Sample([2.0, 2.1])
     found = [check_increase("held out", "a < b", there), check_increase("scape", "b < c", [Sample([]), Sample([])])]
-    assert words_of(claims_table(found)) == (
+    assert table_cells(claims_table(found)) == (
         ["claim", "held out", "scape"],
         [["a < b", "supported (0.70 to 1.30)", ""]],
     )

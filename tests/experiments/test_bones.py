@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch.collections.atlas import Atlas
-from meshmatch.experiments.makers.bones import BUMP, HIGH, Bone, draw_bones, main, near, scan
+from meshmatch.experiments.makers.bones import BUMP, HIGH, Bone, bump_at, draw_bones, main, scan
 from meshmatch.shapes.files import load_shape
 
 
@@ -40,7 +40,7 @@ def in_correspondence(bones: list[Bone], vertices: int) -> tuple[Atlas, np.ndarr
 def test_a_bump_of_three_millimetres_is_found_where_it_is_and_nowhere_else() -> None:
     atlas, directions, known = in_correspondence(draw_bones(20), 900)
     found = atlas.anova("form ~ log(size) + sex + group", known, permutations=999).table.effects[2]
-    places, bump = found.places, near(directions, BUMP, 40.0)[:, 0]
+    places, bump = found.places, bump_at(directions, BUMP, 40.0)[:, 0]
     assert places is not None
     hit = places.p_corrected <= 0.05
     assert found.p_anywhere == 1 / 1000 and found.coefficients == ("group: plain - bump",)

@@ -13,14 +13,14 @@ from meshmatch.experiments.runner import (
     Seed,
     command,
     commit,
-    keep,
     names_of,
     once,
     plain,
-    recall,
+    read_cached,
     spread,
     table,
-    words_of,
+    table_cells,
+    write_cached,
 )
 
 ROWS = [{"set": "scape", "mean": 1.234, "share": 0.25}, {"set": "faust", "mean": float("nan")}]
@@ -73,7 +73,7 @@ def test_names_are_checked_and_items_are_spread() -> None:
 
 
 def test_a_table_as_words() -> None:
-    columns, rows = words_of(table("T", ROWS, {"set": "set", "mean": "mean:.1f"}))
+    columns, rows = table_cells(table("T", ROWS, {"set": "set", "mean": "mean:.1f"}))
     assert (columns, rows) == (["set", "mean"], [["scape", "1.2"], ["faust", ""]])
 
 
@@ -102,24 +102,24 @@ def test_a_result_is_measured_once(tmp_path: Path) -> None:
 
     path = tmp_path / "new" / "run.json"
     asked = {"pairs": (("a", "b"),), "seed": 0}
-    assert recall(path, asked) is None
-    assert once(path, asked, measure) == once(path, asked, measure) == recall(path, asked)
+    assert read_cached(path, asked) is None
+    assert once(path, asked, measure) == once(path, asked, measure) == read_cached(path, asked)
     assert len(calls) == 1
 
 
 def test_a_result_of_other_choices_is_refused(tmp_path: Path) -> None:
-    keep(tmp_path / "run.json", {"seed": 0, "steps": 5}, {"cm": 1})
+    write_cached(tmp_path / "run.json", {"seed": 0, "steps": 5}, {"cm": 1})
     with pytest.raises(OptionError, match=r"other choices \(seed, steps\)"):
-        recall(tmp_path / "run.json", {"seed": 1, "steps": 6})
+        read_cached(tmp_path / "run.json", {"seed": 1, "steps": 6})
     with pytest.raises(OptionError, match=r"\(minutes\)"):
-        recall(tmp_path / "run.json", {"seed": 0, "steps": 5, "minutes": 2})
+        read_cached(tmp_path / "run.json", {"seed": 0, "steps": 5, "minutes": 2})
 
 
 @pytest.mark.parametrize("words", ["{", "[]", "{}", "3", "[" * 5000, '"asked"'])
 def test_a_damaged_result_is_told(words: str, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(words)
     with pytest.raises(InputError, match=r"run\.json is not a result"):
-        recall(tmp_path / "run.json", {})
+        read_cached(tmp_path / "run.json", {})
 
 
 def test_commit_without_git(tmp_path: Path) -> None:

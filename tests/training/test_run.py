@@ -34,7 +34,7 @@ from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import registered_source
-from meshmatch.training.load_data import template_of
+from meshmatch.training.load_data import known_template
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipe_files import read_recipe
@@ -433,7 +433,7 @@ def test_the_template_of_a_training_is_known_before_its_shapes(prepared: Path) -
     usual = people()
 
     def known(shapes=None, kind=None, start=human):
-        found = template_of(shapes, kind, usual, start)
+        found = known_template(shapes, kind, usual, start)
         return None if found is None else found.hash
 
     assert known() == known(kind=Bodies()) == human.template.hash

@@ -68,16 +68,16 @@ class Bone:
             ((0.0, 0.75, -0.66), (0.0, -5.0, 3.0), 12.0),
             ((-0.97, 0.0, -0.2), (-5.0, 0.0, 2.0), 25.0),
         ):
-            points += near(directions, place, narrow) * np.array(push)
+            points += bump_at(directions, place, narrow) * np.array(push)
         rng = np.random.default_rng(0)
         for place, amount in zip(rng.standard_normal((_PLACES, 3)), self.varies, strict=True):
-            points += amount * near(directions, place, 6.0) * directions
+            points += amount * bump_at(directions, place, 6.0) * directions
         if self.group == "bump":
-            points += HIGH * near(directions, BUMP, 40.0) * np.array(BUMP)
+            points += HIGH * bump_at(directions, BUMP, 40.0) * np.array(BUMP)
         return np.asarray(self.size * points)
 
 
-def near(directions: Float[Floats, "N 3"], place: Sequence[float] | Floats, narrow: float) -> Float[Floats, "N 1"]:
+def bump_at(directions: Float[Floats, "N 3"], place: Sequence[float] | Floats, narrow: float) -> Float[Floats, "N 1"]:
     """Bump function on the sphere: 1 in the direction ``place``, decaying around it; larger ``narrow`` decays faster."""
     direction = np.asarray(place) / np.linalg.norm(place)
     return np.asarray(np.exp(narrow * (directions @ direction - 1.0))[:, None])

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.experiments.makers.bones import draw_bones, near, outward
+from meshmatch.experiments.makers.bones import bump_at, draw_bones, outward
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,12 @@ def molars(count: int, seed: int = 0, vertices: int = 4000) -> Registered:
              ((0.05, -0.6, -0.8), (0.1, -1.5, -8.0)))  # fmt: skip
     shapes = []
     for _ in range(count):
-        verts = crown - 1.0 * near(d, (0.0, 0.0, 1.0), 9.0) * [0.0, 0.0, 1.0]
+        verts = crown - 1.0 * bump_at(d, (0.0, 0.0, 1.0), 9.0) * [0.0, 0.0, 1.0]
         for place, high in cusps:
-            verts = verts + high * rng.uniform(0.7, 1.3) * near(d, place, 28.0) * [0.0, 0.0, 1.0]
-        verts = verts + rng.uniform(0.5, 1.1) * near(d, (0.75, -0.6, 0.2), 30.0) * [0.6, -0.7, 0.2]
+            verts = verts + high * rng.uniform(0.7, 1.3) * bump_at(d, place, 28.0) * [0.0, 0.0, 1.0]
+        verts = verts + rng.uniform(0.5, 1.1) * bump_at(d, (0.75, -0.6, 0.2), 30.0) * [0.6, -0.7, 0.2]
         for place, push in roots:
-            verts = verts + rng.uniform(0.8, 1.2) * near(d, place, 14.0) * np.array(push)
+            verts = verts + rng.uniform(0.8, 1.2) * bump_at(d, place, 14.0) * np.array(push)
         size = 1 + 0.07 * rng.standard_normal() + 0.05 * rng.standard_normal(3)
         shapes.append(varied(verts * size, 0.35, 3.0, rng))
     return Registered(np.array(shapes), faces)
@@ -104,7 +104,7 @@ def knees(count: int, seed: int = 0, vertices: int = 2400) -> Registered:
         gap = upper[:, 2].min() - lower[:, 2].max() - 3.0
         joint = np.array([0.0, 0.0, upper[:, 2].min()])
         lower = (lower + np.array([2.0, 0.0, gap]) - joint) @ bend.T + joint
-        patella = small * [11.0, 5.0, 13.0] * rng.uniform(0.85, 1.15, 3) - 2.5 * near(small, (0.5, -0.8, 0.2), 6.0)
+        patella = small * [11.0, 5.0, 13.0] * rng.uniform(0.85, 1.15, 3) - 2.5 * bump_at(small, (0.5, -0.8, 0.2), 6.0)
         patella += joint + np.array([1.5, upper[:, 1].max() + 9.0, 24.0 + rng.normal(0, 2)])
         shapes.append(np.concatenate([varied(upper, 0.8, 15.0, rng), varied(lower, 0.8, 15.0, rng), patella]))
     return Registered(np.array(shapes), faces)

@@ -81,9 +81,9 @@ class Study:
         """Return a cached result, or measure it; None if it is missing and ``show`` is set."""
         name = path.relative_to(self.folder).as_posix()
         if name in self.earlier and not path.is_file():
-            result: dict[str, Any] | None = runner.as_asked(self.earlier[name], asked, f"{name} of --rows")
+            result: dict[str, Any] | None = runner.check_cached(self.earlier[name], asked, f"{name} of --rows")
         else:
-            result = runner.recall(path, asked) if self.show else runner.once(path, asked, measure)
+            result = runner.read_cached(path, asked) if self.show else runner.once(path, asked, measure)
         if result is not None:
             self.rows[name] = result
         return result
