@@ -153,7 +153,7 @@ def _read_json(path: Path) -> tuple[list[Any], Any]:
     try:
         return joints, np.array(rotations, np.float64)
     except (ValueError, TypeError, OverflowError):
-        raise ValueError("rotations are not lists of numbers, equally long") from None
+        raise ValueError("rotations are not lists of numbers of equal length") from None
 
 
 def _read_csv(path: Path) -> tuple[list[Any], Any]:
@@ -175,7 +175,7 @@ def _read_csv(path: Path) -> tuple[list[Any], Any]:
             try:
                 turns[key] = [float(word) for word in row[2:]]
             except ValueError:
-                raise ValueError(f"line {rows.line_num} has words where numbers belong") from None
+                raise ValueError(f"line {rows.line_num} has text instead of numbers") from None
     if len(poses) * len(joints) > MAX_VECTORS:
         raise ValueError(f"{len(poses)} poses of {len(joints)} joints are too many")
     vectors = np.zeros((len(poses), len(joints), 3))

@@ -115,7 +115,7 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         They are not checked on a GPU, where only meshmatch's own sources draw.
         """
         if not callable(self.source):
-            hint = "docs/training.md has one of your own"
+            hint = "see docs/training.md for custom sources"
             raise InputError(f"a source is a function that draws shapes, not {type(self.source).__name__}", hint)
         shapes = self.source(self.shapes, generator)
         return (
@@ -189,16 +189,16 @@ def _check_shapes(drawn: Any, count: int, V: int) -> Float[Tensor, "N V 3"]:
     try:
         verts: Tensor = torch.as_tensor(drawn).float()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"a source must give vertices, not {type(drawn).__name__}", "it returns a tensor") from error
+        raise InputError(f"a source must return vertices, not {type(drawn).__name__}", "return a tensor") from error
     if verts.ndim != 3 or len(verts) != count or verts.shape[1] < V or verts.shape[2] != 3:
         expected = f"({count}, V, 3) with the template's vertices"
-        raise InputError(
-            f"a source must give vertices {expected}, not {tuple(verts.shape)}", "it is asked for `count` shapes"
-        )
+        raise InputError(f"a source must return vertices {expected}, not {tuple(verts.shape)}", "return `count` shapes")
     if not verts.isfinite().all():
-        raise InputError("a source gave vertices that are nan or infinite", "look at the shapes that it draws")
+        raise InputError("a source returned vertices that are nan or infinite", "check the shapes that it draws")
     if not (verts.amax(1) > verts.amin(1)).any(1).all():
-        raise InputError("a source gave a shape whose vertices are all in one place", "look at what it draws")
+        raise InputError(
+            "a source returned a shape whose vertices are all in one place", "check the shapes that it draws"
+        )
     return verts
 
 

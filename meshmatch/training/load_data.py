@@ -149,7 +149,7 @@ def with_validation(shapes: str | Path | RegisteredShapes | None, training_data:
     if shapes is None:
         return training_data
     if isinstance(training_data.source, ShapeSamples):
-        raise OptionError("learning without correspondence is not measured on registered shapes", "leave them out")
+        raise OptionError("training without correspondence cannot be validated on registered shapes", "leave them out")
     if isinstance(shapes, RegisteredShapes):
         verts, name = np.asarray(shapes.verts, np.float32), shapes.name
         if shapes.template.hash != training_data.template.hash:
@@ -175,7 +175,7 @@ def load_training_data(
     if shapes is None:
         return _load_generated(kind or Bodies(), recipe, progress)
     if kind is not None:
-        raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
+        raise OptionError("generated shapes cannot be combined with a folder of shapes", "leave out one of the two")
     if isinstance(shapes, RegisteredShapes):
         verts = np.asarray(shapes.verts, np.float32)
         source = deformed_source(torch.from_numpy(verts))

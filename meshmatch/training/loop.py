@@ -87,7 +87,7 @@ class TrainConfig:
         if self.minutes is not None and not (isinstance(self.minutes, int | float) and self.minutes > 0):
             raise OptionError(f"minutes must be positive, not {self.minutes!r}")
         if not isinstance(self.loss, Objective):
-            raise OptionError(f"a loss is an Objective, not {self.loss!r}", "docs/training.md has one of your own")
+            raise OptionError(f"a loss is an Objective, not {self.loss!r}", "see docs/training.md for custom losses")
 
 
 @dataclass(frozen=True)
@@ -463,9 +463,7 @@ def _check_terms(terms: Any) -> None:
 def _check_finite(terms: dict[str, Tensor], step: int) -> None:
     if not terms["total"].isfinite():
         not_finite = ", ".join(sorted(name for name, each in terms.items() if not each.isfinite()))
-        raise ModelError(
-            f"the training diverged: not finite at step {step + 1:,} are {not_finite}", "take a lower rate"
-        )
+        raise ModelError(f"the training diverged at step {step + 1:,}; not finite: {not_finite}", "lower the rate")
 
 
 def _keep_freed_memory() -> None:

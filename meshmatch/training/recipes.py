@@ -227,7 +227,7 @@ def recipe_for(
         Kind(kind)  # raises if the kind is unknown
     if shapes is not None:
         if kind is not None:
-            raise OptionError("generated shapes do not go with a folder of shapes", "leave out one of the two")
+            raise OptionError("generated shapes cannot be combined with a folder of shapes", "leave out one of the two")
         check_prepared(shapes)
     if shapes is not None and (unsupervised or not is_registered(shapes)):
         return paper_clouds() if preset == "paper" else clouds()

@@ -303,7 +303,7 @@ def test_of_several_processes_one_speaks(
         ("--picture l.jpg", 1, "l.jpg"),
         ("--picture nowhere/l.png", 1, "there is no folder"),
         ("--bodies 20001", 1, "20,000"),
-        ("--kind human --shapes nowhere", 1, "do not go with a folder"),
+        ("--kind human --shapes nowhere", 1, "cannot be combined with a folder"),
     ],
 )
 def test_what_cannot_be_is_told(run: Run, stub: Recorder, tmp_path: Path, words: str, status: int, told: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bools, Floats
-from meshmatch.experiments.makers.bones import Scanned, draw_bones, scan
+from meshmatch.experiments.makers.bones import BoneScan, draw_bones, scan
 from meshmatch.fitting import alike
 from meshmatch.fitting.alike import as_part, finer, is_finer, match_alike
 from meshmatch.fitting.direct import MIRROR, DirectMatch, match_either_side
@@ -41,7 +41,7 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alike, "ViscousConfig", few)
 
 
-def cut(bone: Scanned, high: float, way: float = 1.0) -> tuple[Shape, Bools]:
+def cut(bone: BoneScan, high: float, way: float = 1.0) -> tuple[Shape, Bools]:
     """What lies below a height of a bone's axis, or above it, and which vertices those are."""
     kept = way * bone.directions[:, 2] < way * high
     faces = bone.shape.faces[kept[bone.shape.faces].all(1)]
@@ -49,7 +49,7 @@ def cut(bone: Scanned, high: float, way: float = 1.0) -> tuple[Shape, Bools]:
     return Shape(bone.shape.verts[used], np.searchsorted(used, faces), "broken"), np.isin(np.arange(len(kept)), used)
 
 
-def errors(found: DirectMatch, source: Scanned, target: Scanned, of: Shape, kept: Bools | None = None) -> Floats:
+def errors(found: DirectMatch, source: BoneScan, target: BoneScan, of: Shape, kept: Bools | None = None) -> Floats:
     """How far from their places, in mm, those vertices of a source arrive on a target."""
     directions = source.directions if kept is None else source.directions[kept]
     at = cKDTree(found.source.points_in_file).query(of.verts)[1]

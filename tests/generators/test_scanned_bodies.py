@@ -181,7 +181,7 @@ def test_people_are_a_mixture_and_the_card_says_so(rig: MomentumRig, monkeypatch
 
 
 def test_another_template_is_refused(rig: MomentumRig) -> None:
-    with pytest.raises(OptionError, match="do not lie under template"):
+    with pytest.raises(OptionError, match="were not made for template"):
         scanned_source(egg_template(), on_own_vertices(rig))
     with pytest.raises(OptionError, match="share"):
         on_own_vertices(rig, 1.5)

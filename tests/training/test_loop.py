@@ -389,7 +389,7 @@ class Spoilt(CorrespondenceLoss):
     (lambda terms: {**terms, "mine": terms["total"].expand(3)}, OptionError, "scalar tensors"),
     (lambda terms: {"mine": terms["total"]}, OptionError, "'total'"),
     (lambda terms: {"total": terms["total"].detach()}, OptionError, "gradient"),
-    (lambda terms: {**terms, "total": terms["total"] / 0}, ModelError, "not finite at step 1 are total"),
+    (lambda terms: {**terms, "total": terms["total"] / 0}, ModelError, "at step 1; not finite: total"),
 ])  # fmt: skip
 def test_a_loss_that_nothing_can_be_learned_from_is_told(egg: Template, how: Any, error: Any, words: str) -> None:
     run = trainer(egg, replace(CONFIG, loss=Spoilt(how=how)))

@@ -488,7 +488,7 @@ def test_a_second_training_in_a_folder_is_refused(prepared: Path, tmp_path: Path
 
 
 def test_bodies_do_not_go_with_a_folder(prepared: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="generated shapes do not go with a folder"):
+    with pytest.raises(OptionError, match="generated shapes cannot be combined with a folder"):
         train(tmp_path / "mine", shapes=prepared, kind=bodies.Bodies())
 
 

@@ -84,7 +84,7 @@ def bump_at(directions: Float[Floats, "N 3"], place: Sequence[float] | Floats, n
 
 
 @dataclass(frozen=True, eq=False)
-class Scanned:
+class BoneScan:
     """A scanned bone: its own triangulation, the ``frame`` from the scan's to the bone's coordinates, and the direction of
     every vertex, which is the ground truth.
     """
@@ -112,7 +112,7 @@ def draw_bones(count: int, seed: int = 0) -> list[Bone]:
     return bones
 
 
-def scan(bone: Bone, vertices: int, seed: int = 0) -> Scanned:
+def scan(bone: Bone, vertices: int, seed: int = 0) -> BoneScan:
     """Scan a bone at a random position and orientation; the seed determines these and the triangulation."""
     rng = np.random.default_rng([seed, 1])
     number = np.arange(vertices) + 0.5
@@ -125,7 +125,7 @@ def scan(bone: Bone, vertices: int, seed: int = 0) -> Scanned:
     mirror = np.diag([-1.0, 1.0, 1.0]) if bone.side == "left" else np.eye(3)
     frame = Frame(1.0, mirror @ Rotation.random(rng=rng).as_matrix(), rng.uniform(-100, 100, 3))
     verts = frame.undo(bone.points(directions))
-    return Scanned(bone, Shape(verts, faces[:, ::-1] if bone.side == "left" else faces, bone.name), frame, directions)
+    return BoneScan(bone, Shape(verts, faces[:, ::-1] if bone.side == "left" else faces, bone.name), frame, directions)
 
 
 def outward(directions: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3"]:
@@ -135,7 +135,7 @@ def outward(directions: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[In
     return np.where(inside[:, None], faces[:, ::-1], faces)
 
 
-def write_bones(folder: Path, scans: Sequence[Scanned]) -> None:
+def write_bones(folder: Path, scans: Sequence[BoneScan]) -> None:
     """Write ``scans/NAME.ply``, ``landmarks/NAME.csv`` with the true landmarks, and ``table.csv`` with the metadata."""
     make_folder(folder / "scans")
     make_folder(folder / "landmarks")

@@ -119,7 +119,7 @@ class Study:
                 def measure(bench: BenchSet = bench, method: str = method) -> dict[str, Any]:
                     if not (folder / "model").is_dir():
                         hint = "train it again: remove that folder, and its rows from the file of --rows"
-                        raise OptionError(f"{folder} has lost its model", hint)
+                        raise OptionError(f"{folder} lacks its model", hint)
                     runner.tell(f"measuring {run.name} on {bench.name}: {method}")
                     model, subjects = as_model(folder / "model"), self.subjects(bench)
                     return {**self.metadata(), **errors_of(model, run, subjects, self.model, method, self.measure)}
