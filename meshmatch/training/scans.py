@@ -46,7 +46,7 @@ class ScanConfig:
 def surface_area(
     verts: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
 ) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B 3"]]:
-    """Face areas and their area-weighted centroid."""
+    """Areas of the faces, and the area-weighted centroid of each shape."""
     a, b, c = (verts[:, faces[:, k]] for k in range(3))
     area = 0.5 * torch.linalg.cross(b - a, c - a).square().sum(-1).sqrt()
     centroid = (area[..., None] * (a + b + c)).sum(1) / (3 * area.sum(1, keepdim=True))

@@ -143,7 +143,7 @@ def test_a_source_gives_shapes_on_the_templates_vertices(egg: Template, network:
 
     assert torch.equal(drawing(lambda verts: verts.double().numpy()).points, data[0].points)
     for change in (lambda v: v[0], lambda v: v[:3], lambda v: v[:, :9], lambda v: v[..., :2], lambda v: None):
-        with pytest.raises(InputError, match="a source must give"):
+        with pytest.raises(InputError, match="a source must return"):
             drawing(change)
     with pytest.raises(InputError, match="nan or infinite"):
         drawing(lambda verts: verts / 0)
