@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import OptionError
-from meshmatch.experiments.makers.human_bodies import Still, body_parts, human_template, standing_body, still_pose
+from meshmatch.experiments.makers.human_bodies import MeanDraw, body_parts, human_template, standing_body, still_pose
 from meshmatch.generators.bodies import draw_identities, sample_bodies, sample_free_pose, sample_pose
 from meshmatch.generators.limbs import FOLDED, Draw, combine_arms_and_legs, draw_arms, draw_limbs, mirror_where
 from meshmatch.generators.rig import Rig, build_rig, forward_kinematics, load_rig, penetration, save_rig, skin
@@ -246,7 +246,7 @@ def test_a_still_body_stands_as_asked(rig: Rig) -> None:
 
 
 def test_still_draws_are_their_means() -> None:
-    still = Still(3)
+    still = MeanDraw(3)
     assert torch.equal(still.normal(4, 100), torch.full((3,), 4.0))
     assert torch.equal(still.uniform(-10, 30), torch.full((3,), 10.0))
     assert torch.equal(still.normal3(50), torch.zeros(3, 3))

@@ -159,7 +159,10 @@ def sample(measured: Measurements, run: Run, where: str, method: str | None = No
 
 
 def claims(measured: Measurements, sets: Sequence[str]) -> list[Claim]:
-    """Test all claims on the held-out shapes and each set; 300 nodes of radius 0.2 are compared with the best other grid point."""
+    """Test all claims on the held-out shapes and each set.
+
+    300 nodes of radius 0.2 are compared with the best other grid point.
+    """
     found_claims = []
     for where in (HELD_OUT, *sets):
         samples_by_claim = {claim_text: [sample(measured, run, where) for run in runs] for claim_text, runs in CLAIMS}
