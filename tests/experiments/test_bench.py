@@ -119,7 +119,7 @@ def test_the_command(
     assert again["sets"]["faust"]["fit_seconds_max"] == 7.0
     assert kept_in == {output / "fits"}
     assert main([*words[:-1], "4", "--output", str(output), "--sets", "faust"]) == 1
-    assert "other choices (seed)" in capsys.readouterr().err
+    assert "other options (seed)" in capsys.readouterr().err
     # A part says that it is one.
     assert main([*words, "--limit-pairs", "2", "--sets", "faust"]) == 0
     text = capsys.readouterr().out

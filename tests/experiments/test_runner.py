@@ -109,7 +109,7 @@ def test_a_result_is_measured_once(tmp_path: Path) -> None:
 
 def test_a_result_of_other_choices_is_refused(tmp_path: Path) -> None:
     write_cached(tmp_path / "run.json", {"seed": 0, "steps": 5}, {"cm": 1})
-    with pytest.raises(OptionError, match=r"other choices \(seed, steps\)"):
+    with pytest.raises(OptionError, match=r"other options \(seed, steps\)"):
         read_cached(tmp_path / "run.json", {"seed": 1, "steps": 6})
     with pytest.raises(OptionError, match=r"\(minutes\)"):
         read_cached(tmp_path / "run.json", {"seed": 0, "steps": 5, "minutes": 2})
