@@ -195,7 +195,7 @@ BROKEN: dict[str, tuple[str, bytes, str]] = {
     "another table": (".csv", b"a,b\n1,2\n", "first line is not pose,joint,x,y,z"),
     "a table without rows": (".csv", b"pose,joint,x,y,z\n", "no poses"),
     "a short row": (".csv", b"pose,joint,x,y,z\n1,head,0,0\n", "line 2 has 4 columns"),
-    "a word": (".csv", b"pose,joint,x,y,z\n1,head,0,0,north\n", "line 2 has words"),
+    "a word": (".csv", b"pose,joint,x,y,z\n1,head,0,0,north\n", "line 2 has text"),
     "a row twice": (".csv", b"pose,joint,x,y,z\n1,head,0,0,1\n1,head,0,0,1\n", "again"),
     "not a number": (".csv", b"pose,joint,x,y,z\n1,head,0,nan,1\n", "not a number"),
 }  # fmt: skip
