@@ -117,7 +117,9 @@ def test_another_decimation_is_laid_on_the_template(rig: AnimalRig, assets: Path
     template = make_template(rest, "ball", NodeConfig("uniform", 60, 0.4))
     assert template.shape.V == len(rig.verts)
     for faces, apart in ((1200, 1e-4), (2000, 0.02)):
-        laid = dog_rig.transfer_rig(dog_rig.symmetric_rig(read_animal(assets / SKIN, assets / SKELETON), faces), template)
+        laid = dog_rig.transfer_rig(
+            dog_rig.symmetric_rig(read_animal(assets / SKIN, assets / SKELETON), faces), template
+        )
         check_rig(laid)
         assert np.array_equal(laid.faces, template.shape.faces)
         own = sqrt_area_frame(rest).apply(resting_animal(laid))
