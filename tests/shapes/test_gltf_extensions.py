@@ -60,7 +60,7 @@ def test_coordinates_and_looks_go_with_the_instances(tmp_path: Path) -> None:
 
 
 def test_instances_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gltf, "MOST_NODES", 2)
+    monkeypatch.setattr(gltf, "MAX_NODES", 2)
     with pytest.raises(InputError, match="over 2 nodes"):
         load_shape(scene(tmp_path, SHIFT, nodes=instances(TRANSLATION=1)))
     with pytest.raises(InputError, match="over 2 nodes"):

@@ -201,7 +201,7 @@ def test_damage_is_told_in_a_line(scene: Path, damage: Damage, words: str) -> No
 
 
 def test_more_shapes_than_a_file_can_mean(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("meshmatch.shapes.formats.MOST_PLACES", 5)
+    monkeypatch.setattr("meshmatch.shapes.formats.MAX_ELEMENTS", 5)
     with pytest.raises(InputError, match="makes 6 vertices and faces, of 5 at most"):
         read(scene)
 

@@ -169,7 +169,7 @@ def test_gltf_of_one_mesh_many_times(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(InputError, match=r"makes [0-9,]+ vertices and faces"):
         load_shape(path)
     monkeypatch.undo()
-    monkeypatch.setattr(gltf, "MOST_NODES", 90)
+    monkeypatch.setattr(gltf, "MAX_NODES", 90)
     with pytest.raises(InputError, match="over 90 nodes"):
         load_shape(path)
 

@@ -1,17 +1,17 @@
-"""Files of shapes: bytes to plain arrays, and a `Shape` to bytes. Here is what the readers of several formats share.
+"""Readers and writers of shape files: bytes to plain arrays, and a `Shape` to bytes. This module has their shared parts.
 
-A map answers for every vertex of a file, so readers keep them all, in order, and never allocate what a header merely
-promises. The readers are our own, because of what trimesh 5.2 does (measured):
+A map has an entry for every vertex of a file, so readers keep all vertices in file order. They never allocate memory for
+counts that a header merely declares. The package has its own readers because of these defects of trimesh 5.2 (measured):
 
-- ply: text takes 1.4 s instead of 0.4 s for 164,000 vertices; importing trimesh takes 0.7 s, and ply is what
-  benchmarks and scans come in. Triangle strips become points, and 16-bit colors lose their upper byte.
+- ply: text takes 1.4 s instead of 0.4 s for 164,000 vertices; importing trimesh takes 0.7 s, and most benchmarks and
+  scans are ply files. Triangle strips become points, and 16-bit colors lose their upper byte.
 - obj: a file with several materials becomes several meshes, each with all the vertices.
-- off: vertex colors are lost, and a face that is cut short vanishes without a word.
-- stl: bytes behind the triangles, a count of 0 or -1, a text without its last line are refused.
-- gltf: meshes come in another order than the scene's (`Rogue.glb`), skins are ignored, strips without indices fail.
+- off: vertex colors are lost, and a truncated face is dropped silently.
+- stl: files with trailing bytes, a count of 0 or -1, or (text) no last line are rejected.
+- gltf: meshes are not in scene order (`Rogue.glb`), skins are ignored, strips without indices fail.
 
-Its writers round: ply to 32 bits, off to ten digits and obj to eight behind the point (1e-20 becomes 0), colors of
-glb to 8 bits of linear light, too few for dark ones. Ours keep every bit of ply, off and obj positions.
+Its writers round: ply positions to 32 bits, off to ten digits, obj to eight decimals (1e-20 becomes 0), and glb colors to
+8 bits of linear light, which is too coarse for dark colors. Ours keep every bit of ply, off and obj positions.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from meshmatch.shapes.colors import light, seen
 NO_FACES = np.empty((0, 3), np.int64)
 NO_MESH = "is it a mesh or a point cloud at all?"
 WRONG_SUFFIX = "does the suffix fit the content?"
-MOST_PLACES = 40_000_000
-"""Vertices and faces of one file: more than anything here can work on."""
-FEW_PLACES = 3_500_000
-"""How many a file of any size may have; and one more for every 12 of its bytes, or 24 where it is text."""
+MAX_ELEMENTS = 40_000_000
+"""Maximum number of vertices and faces, together, in one file: more than any method here can process."""
+BASE_ELEMENTS = 3_500_000
+"""Vertices and faces allowed in a file of any size; each 12 bytes of a binary file (24 of a text file) allow one more."""
 DECIMAL_COMMA = "is that a decimal comma? export it with decimal points, split by spaces"
 _ODD_COMMA = re.compile(rb"(?<!\S)(?![+-]?\d*,\d+(?:[eE][+-]?\d+)?(?!\S))[^\s,]*+,\S*")
 _WORD = re.compile(rb"\S+")
@@ -44,21 +44,23 @@ _SPACE[[9, 10, 11, 12, 13, 32]] = True
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """What a file says, unchecked: positions, maybe NaN; faces; sRGB colors and alpha in 0..1."""
+    """Unchecked content of a file: positions (may contain NaN), faces, and sRGB colors with alpha in 0..1."""
 
     verts: Float[Floats, "V 3"]
     faces: Int[Ints, "F 3"]
     colors: Float[Floats, "V 4"] | None = None
-    skinned: Bool[Bools, " V"] | None = None  # vertices that joints of the file move
-    meshes: tuple[tuple[tuple[str, ...], int], ...] = ()  # of a scene, in order: names (of node and mesh), vertices
+    skinned: Bool[Bools, " V"] | None = None  # mask of the vertices that joints in the file move
+    meshes: tuple[
+        tuple[tuple[str, ...], int], ...
+    ] = ()  # per mesh, in scene order: (names of node and mesh), vertex count
     made_of: tuple[str, ...] = ()  # hashes, see `Shape.made_of`
 
 
 @dataclass(frozen=True, eq=False)
 class Textured:
-    """A mesh that wears one image, ready to be written, in the unit of the file.
+    """A mesh textured with one image, ready to be written, in the unit of the file.
 
-    `uv` belongs to each corner: u to the right, v down; `cutoff` is the threshold of "mask".
+    `uv` has texture coordinates per face corner (u to the right, v down); `cutoff` is the alpha threshold of "mask".
     """
 
     verts: Float[Floats, "V 3"]
@@ -68,37 +70,39 @@ class Textured:
     cutoff: float = 0.5
 
 
-def tell_lost_faces(name: str, listed: int, faces: Int[Ints, "F 3"]) -> None:
-    """Say that a file has faces, but none with three corners."""
-    if listed and not len(faces):
-        warn(f"{name}: none of its {listed} faces has three corners, so it is read as a point cloud")
+def warn_if_no_triangles(name: str, n_listed: int, faces: Int[Ints, "F 3"]) -> None:
+    """Warn if a file lists `n_listed` faces but none yields a triangle."""
+    if n_listed and not len(faces):
+        warn(f"{name}: none of its {n_listed} faces has three corners, so it is read as a point cloud")
 
 
 def damaged(name: str, what: str) -> InputError:
-    """The error for a file that does not hold what it promises."""
+    """Return the `InputError` for a file whose content is inconsistent or incomplete; `what` says how."""
     return InputError(f"{name}: {what[:300]}", "the file is damaged or was cut short; export or download it again")
 
 
-def check_places(name: str, size: int, vertices: int, faces: int = 0, text: bool = False) -> None:
-    """Refuse a file that makes more vertices and faces than its bytes can mean (`InputError`): each takes up to 200 bytes
-    of memory, and hours where there are many.
+def check_element_count(name: str, size: int, vertices: int, faces: int = 0, text: bool = False) -> None:
+    """Raise `InputError` if a file of `size` bytes yields more vertices and faces than that size can plausibly encode.
+
+    Each one takes up to 200 bytes of memory, and processing very many takes hours.
     """
-    most = min(MOST_PLACES, FEW_PLACES + size // (24 if text else 12))
-    if vertices + faces > most:
-        many = f"{name} makes {vertices + faces:,} vertices and faces, of {most:,} at most for its size"
-        raise InputError(many, "decimate it, or export it as a binary .ply or .glb with fewer copies of its meshes")
+    limit = min(MAX_ELEMENTS, BASE_ELEMENTS + size // (24 if text else 12))
+    if vertices + faces > limit:
+        message = f"{name} makes {vertices + faces:,} vertices and faces, of {limit:,} at most for its size"
+        raise InputError(message, "decimate it, or export it as a binary .ply or .glb with fewer copies of its meshes")
 
 
 def runs(starts: Int[Ints, " N"], sizes: Int[Ints, " N"], step: int = 1) -> Int[Ints, " M"]:
-    """start, start + step, ... of every run, one run after the other."""
+    """Concatenate the runs start, start + step, ..., where run i has sizes[i] elements."""
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     return np.asarray(np.repeat(starts, sizes) + step * within)
 
 
 def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
-    """Triangles of polygons: `corners` one polygon after the other, `sizes` how many each has.
+    """Triangulate polygons as fans: a b c d ... becomes a b c, a c d, ...
 
-    A polygon a b c d ... becomes a b c, a c d, ...; one of fewer than 3 corners becomes nothing.
+    `corners` lists the vertices of all polygons, one polygon after the other; `sizes` has the corner count of each.
+    Polygons with fewer than 3 corners yield no triangles.
     """
     if len(sizes) and (sizes == 3).all():
         return corners.reshape(-1, 3)
@@ -108,7 +112,7 @@ def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
 
 
 def strips(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
-    """Triangles of strips, given as to `fan`: a b c d ... becomes a b c, c b d, ..., every other one turned over."""
+    """Split triangle strips, given as for `fan`: a b c d ... becomes a b c, c b d, ... (every other triangle flipped)."""
     counts = np.maximum(sizes - 2, 0)
     first = runs(np.cumsum(sizes) - sizes, counts)
     odd = runs(np.zeros(len(counts), np.int64), counts) % 2
@@ -116,66 +120,70 @@ def strips(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]
 
 
 def indices(name: str, values: NDArray[Any]) -> Ints:
-    """Numbers of vertices, or `InputError`: floats are what text files are read as."""
+    """Convert vertex indices to integers (text files are parsed as floats); `InputError` for NaN, inf or huge values."""
     if values.dtype.kind == "f" and not (np.abs(values) < 2**53).all():
         raise damaged(name, "a face refers to a vertex that is not a number")
     return values.astype(np.int64)
 
 
 def painted(channels: Float[Floats, "N C"]) -> Float[Floats, "N 4"]:
-    """Colors of 3 or 4 channels, which count to 255 if one is above 1, else to 1; of alpha this is told apart."""
+    """RGBA in 0..1 from 3 or 4 channels, missing alpha being 1.
+
+    Values are taken to range to 255 if any is above 1, else to 1; this is decided separately for color and for alpha.
+    """
     channels = np.nan_to_num(channels)
     colors = np.ones((len(channels), 4))
-    for some in (slice(0, 3), slice(3, channels.shape[1])):
-        largest = 255.0 if (channels[:, some] > 1).any() else 1.0
-        colors[:, some] = np.clip(channels[:, some] / largest, 0.0, 1.0)
+    for channel_range in (slice(0, 3), slice(3, channels.shape[1])):
+        largest = 255.0 if (channels[:, channel_range] > 1).any() else 1.0
+        colors[:, channel_range] = np.clip(channels[:, channel_range] / largest, 0.0, 1.0)
     return colors
 
 
 def as_float32(values: Floats, suffix: str) -> NDArray[np.float32]:
-    """Values for a file of 32-bit floats; `OutputError` for finite ones that are too large for these."""
+    """Convert values to little-endian float32 for a file; `OutputError` if a finite value overflows."""
     with np.errstate(over="ignore"):
         written = values.astype("<f4")
     if not np.isfinite(written).all() and (np.isinf(written) & np.isfinite(values)).any():
-        what = f"the shape reaches beyond {np.finfo(np.float32).max:.1e}, the largest number of a {suffix} file"
-        raise OutputError(what, "save it as .ply, .obj or .off, or scale it first")
+        message = f"the shape reaches beyond {np.finfo(np.float32).max:.1e}, the largest number of a {suffix} file"
+        raise OutputError(message, "save it as .ply, .obj or .off, or scale it first")
     return written
 
 
 def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
-    """Colors of meshes one after the other, white for those without; None if none has any."""
+    """Concatenate the colors of several meshes, white for meshes without colors; None if no mesh has colors."""
     if all(color is None for color in colors):
         return None
     return np.vstack([np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)])
 
 
 def colors_of_faces(count: int, corners: Int[Ints, " N"], colors: Float[Floats, "N 4"]) -> Float[Floats, "count 4"]:
-    """Colors of vertices where a file has them for faces: the mean light of those around; white where there are none.
+    """Convert face colors to vertex colors: the mean, in linear light, of the adjacent faces; white for unused vertices.
 
-    `corners` are the vertices of all faces, one face after the other, each with the color of its face.
+    `corners` are the vertices of all faces, one face after the other; `colors` has the color of its face for each corner.
     """
-    fine = (corners >= 0) & (corners < count)
-    corners, own = corners[fine], light(colors[fine])
-    many = np.bincount(corners, minlength=count)[:, None]
-    total = np.stack([np.bincount(corners, channel, count) for channel in own.T], axis=1)
-    return np.where(many > 0, seen(total / np.maximum(many, 1)), 1.0)
+    in_range = (corners >= 0) & (corners < count)
+    corners, linear = corners[in_range], light(colors[in_range])
+    n_corners = np.bincount(corners, minlength=count)[:, None]
+    total = np.stack([np.bincount(corners, channel, count) for channel in linear.T], axis=1)
+    return np.where(n_corners > 0, seen(total / np.maximum(n_corners, 1)), 1.0)
 
 
 def without_comments(text: bytes) -> bytes:
+    """Remove everything from each ``#`` to the end of its line."""
     return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
 
 
-def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
-    """All the whitespace-separated numbers of a text, fast, nan and inf included; `InputError` for other words.
+def parse_numbers(name: str, text: bytes) -> Float[Floats, " N"]:
+    """Parse all whitespace-separated numbers of a text, including nan and inf; `InputError` for any other word.
 
-    A decimal comma counts as a decimal point where no number of the text has a point.
+    A decimal comma is accepted if no number of the text has a decimal point.
     """
     if not text.strip():
         return np.empty(0)
     if b"," in text:
-        text = with_points(name, text)
+        text = with_decimal_points(name, text)
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # how fromstring says that it met a word
+        warnings.simplefilter("error", DeprecationWarning)  # fromstring raises it at a word that is not a number
         try:
             return np.fromstring(text, dtype=np.float64, sep=" ")
         except (DeprecationWarning, ValueError):
@@ -186,15 +194,13 @@ def numbers(name: str, text: bytes) -> Float[Floats, " N"]:
         raise damaged(name, f"found {error} where a number should be") from None
 
 
-def with_points(name: str, text: bytes) -> bytes:
-    """A text of numbers that are split by spaces, its decimal commas made points; `InputError` where commas may mean
-    something else.
-    """
+def with_decimal_points(name: str, text: bytes) -> bytes:
+    """Replace the decimal commas of whitespace-separated numbers by points; `InputError` where commas are ambiguous."""
     other = _ODD_COMMA.search(text)
     if other or b"." in text:
         mixed = "some of its numbers have a comma, others a point"
-        odd = mixed if other is None else f"found {other[0][:20].decode(errors='replace')!r} where a number should be"
-        raise InputError(f"{name}: {odd}", DECIMAL_COMMA)
+        found = mixed if other is None else f"found {other[0][:20].decode(errors='replace')!r} where a number should be"
+        raise InputError(f"{name}: {found}", DECIMAL_COMMA)
     return text.replace(b",", b".")
 
 
@@ -208,38 +214,41 @@ def _number(word: bytes) -> float:
 
 
 def words_per_line(text: bytes) -> Int[Ints, " lines"]:
-    """How many words each non-blank line of a text has."""
+    """Count the words of each non-blank line of a text."""
     if not text:
         return np.empty(0, np.int64)
     characters = np.frombuffer(text, np.uint8)
     space = _SPACE[characters]
-    begins = ~space
-    begins[1:] &= space[:-1]
-    before = np.searchsorted(np.flatnonzero(begins), np.flatnonzero(characters == 10))
-    counts = np.diff(before, prepend=0, append=np.count_nonzero(begins))
+    starts_word = ~space
+    starts_word[1:] &= space[:-1]
+    words_before = np.searchsorted(np.flatnonzero(starts_word), np.flatnonzero(characters == 10))
+    counts = np.diff(words_before, prepend=0, append=np.count_nonzero(starts_word))
     return counts[counts > 0].astype(np.int64)
 
 
 def columns(
     values: Float[Floats, " words"], counts: Int[Ints, " lines"], first: int, last: int
 ) -> Float[Floats, "lines width"]:
-    """Columns `first` to `last` (excluded) of lines of unequal length: flat values, and words per line."""
+    """Select columns `first` to `last` (exclusive) from lines of unequal length.
+
+    `values` has the values of all lines, flattened; `counts` has the number of values per line.
+    """
     if len(counts) and (counts == counts[0]).all():
         return values.reshape(len(counts), -1)[:, first:last]
     starts = np.cumsum(counts) - counts
     return np.asarray(values[starts[:, None] + np.arange(first, last)])
 
 
-def lines_of(text: bytes, *words: bytes) -> list[tuple[bytes, Ints]]:
-    """For each of the given first words: its lines without that word, and which lines of the text they are.
+def lines_starting_with(text: bytes, *words: bytes) -> list[tuple[bytes, Ints]]:
+    """For each of the words, return the lines that start with it, without the word, and their line indices in the text.
 
-    Spaces in front of the word are allowed.
+    White space before the word is allowed.
     """
     characters = np.frombuffer(text + b"\n", np.uint8)
     ends = np.flatnonzero(characters == 10)
     starts = np.concatenate([[0], ends[:-1] + 1])
     if ((characters[starts] == 32) | (characters[starts] == 9)).any():
-        return lines_of(re.sub(rb"^[ \t]+", b"", text, flags=re.MULTILINE), *words)
+        return lines_starting_with(re.sub(rb"^[ \t]+", b"", text, flags=re.MULTILINE), *words)
     lengths = np.diff(ends, prepend=-1)
     out = []
     for word in words:

@@ -1,8 +1,8 @@
-"""glTF 2.0, binary (glb) and text (gltf): the triangles and points of a scene, where the scene puts them.
+"""glTF 2.0, binary (glb) and text (gltf): read the triangles and points of a scene in scene coordinates.
 
-Specification: Khronos glTF 2.0. A skinned mesh stands as its joints stand in the file (sections 3.7.3 and 5.28), so
-that it fits whatever hangs from the same joints. Animations and morph targets are ignored; materials and weights are
-read by `meshmatch.shapes.formats.gltf_attributes`, files written by `meshmatch.shapes.formats.gltf_out`.
+Specification: Khronos glTF 2.0. A skinned mesh is posed by its joints as the file places them (sections 3.7.3 and 5.28),
+so that it fits other objects attached to the same joints. Animations and morph targets are ignored;
+`meshmatch.shapes.formats.gltf_attributes` reads materials and weights, `meshmatch.shapes.formats.gltf_out` writes files.
 """
 
 from __future__ import annotations
@@ -25,13 +25,22 @@ from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.companions import beside
-from meshmatch.shapes.formats import NO_FACES, WRONG_SUFFIX, Raw, check_places, damaged, fan, joined_colors, strips
+from meshmatch.shapes.formats import (
+    NO_FACES,
+    WRONG_SUFFIX,
+    Raw,
+    check_element_count,
+    damaged,
+    fan,
+    joined_colors,
+    strips,
+)
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS, DRACO, MESHOPT, WIDTHS, decompress
 from meshmatch.shapes.input_files import check_text, json_of, read_bytes
 
 COMPRESSED = (DRACO, *MESHOPT)
 INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
-# What a file may require: extensions that are read, and others that change neither what is drawn nor where.
+# Extensions that a file may require: those that are read, and those that affect neither geometry nor base color.
 _KNOWN = ("KHR_mesh_quantization", INSTANCES, _VISIBILITY)
 _HARMLESS = re.compile(
     r"[A-Z0-9]+_(?:materials?|textures?|lights?|techniques?|animations?|audio|xmp|node_hover|node_select|interactiv)\w*|"
@@ -39,37 +48,38 @@ _HARMLESS = re.compile(
 )
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 SUFFIXES = (".glb", ".gltf", ".vrm", *blender.SUFFIXES)
-"""Of files in this format: a vrm is a glb with a character, and Blender turns others into a glb."""
-MOST_NODES = 100_000
-"""Nodes of a scene, and primitives that it draws: each takes up to 0.1 ms."""
-ORIGINS, MOST_ORIGINS = "meshmatch", 16
-"""Where a file says what its mesh was made of: in the extras of its asset."""
-Found = TypeVar("Found")
+"""Suffixes of files in this format: a vrm is a glb with a character, and Blender converts other formats to glb."""
+MAX_NODES = 100_000
+"""Maximum number of nodes of a scene, and of mesh instances plus primitives that it draws: each takes up to 0.1 ms."""
+ORIGINS, MAX_ORIGINS = "meshmatch", 16
+"""Key in the extras of the asset under which a file records the hashes of its source meshes, and their maximum number."""
+T = TypeVar("T")
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """All triangles and points of the scene, one primitive after the other, parents before children."""
+    """Read all triangles and points of the scene, one primitive after the other, parent nodes before their children."""
     return understood(path, data, "scene makes", Document.scene)
 
 
 def digest(faces: Int[Ints, "F 3"]) -> str:
-    """16 hexadecimal digits that name these triangles."""
+    """Hash triangles to 16 hexadecimal digits."""
     return hashlib.sha256(np.ascontiguousarray(faces, np.int64).data if len(faces) else b"").hexdigest()[:16]
 
 
-def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], Found]) -> Found:
-    """What a reader makes of a file; `InputError` for what a description that is not as it should be can cause. Numbers
-    that are not finite are judged by who asked for them.
+def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], T]) -> T:
+    """Parse a file and return what `reader` extracts from it; a malformed JSON description raises `InputError`.
+
+    `what` begins the error message, such as "scene makes". Checking values for NaN and inf is left to the caller.
     """
     try:
         with np.errstate(all="ignore"):
             return reader(Document(path, data))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
-        raise damaged(path.name, f"its {what} no sense: {_in_words(error)}") from error
+        raise damaged(path.name, f"its {what} no sense: {_describe_error(error)}") from error
 
 
-def _in_words(error: Exception) -> str:
-    """What is wrong with a description, of the error that reading it raised."""
+def _describe_error(error: Exception) -> str:
+    """Describe the defect of a file, given the exception that reading its JSON description raised."""
     if isinstance(error, KeyError):
         return f"{error} is missing"
     if isinstance(error, IndexError):
@@ -82,7 +92,7 @@ def _in_words(error: Exception) -> str:
 
 
 class Document:
-    """A parsed file; its buffers are read when they are asked for."""
+    """A parsed glTF file; buffers are read on demand."""
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.name = path, path.name
@@ -112,9 +122,9 @@ class Document:
         self.buffers: dict[int, bytes] = {}
         self.world: dict[int, Floats] = {}
         self.hidden: set[int] = set()
-        self._bones: dict[int, Floats] = {}  # a thousand meshes may hang from one skin of a thousand joints
+        self._bones: dict[int, Floats] = {}  # cached: a thousand meshes may share one skin of a thousand joints
         self._mirrors: dict[int, bool] = {}
-        self._bound: int | None = None
+        self._sparse_limit: int | None = None
         if compressed := {each for each in required if each in COMPRESSED}:
             self.buffers |= decompress(self.name, self.size, self.json, self.buffer, compressed)
 
@@ -122,7 +132,7 @@ class Document:
         return InputError(f"{self.name} is compressed ({extension})", "export it without mesh compression")
 
     def _chunks(self, data: bytes) -> bytes:
-        """The JSON chunk; the binary one is kept in `body`."""
+        """Return the JSON chunk of a glb; the binary chunk is stored in `body`."""
         version, length, size = np.frombuffer(data[4:16].ljust(12, b"\0"), "<u4").tolist()
         if version != 2:
             raise InputError(f"{self.name} is glb version {version}", "export it as glTF 2.0")
@@ -134,111 +144,115 @@ class Document:
         return data[20 : 20 + size]
 
     def scene(self) -> Raw:
+        """Read the whole scene: geometry, colors, skinned vertices and mesh names."""
         verts: list[Floats] = []
         faces: list[Ints] = [NO_FACES]
         colors: list[Floats | None] = []
         skinned: list[Bools] = []
         meshes: list[tuple[tuple[str, ...], int]] = []
-        places = seen = 0
-        # One mesh may stand in a scene a thousand times, so that a small file can promise any number.
+        n_elements = n_verts = 0
+        # A scene may instance one mesh a thousand times, so that a small file can declare any number of vertices.
         for node, primitive, place in self.primitives():
             vertices = self.count(primitive["attributes"]["POSITION"])
             corners = self.count(primitive["indices"]) if "indices" in primitive else vertices
             thirds = 1 if primitive.get("mode", _TRIANGLES) in (_STRIP, _FAN) else 3
-            places += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
-            check_places(self.name, self.size, places)
-            own = self.placed(node, primitive, place)
+            n_elements += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
+            check_element_count(self.name, self.size, n_elements)
+            positions = self.placed(node, primitive, place)
             triangles = self.drawn_triangles(node, primitive, place)
-            if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(own)):
-                raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(own)}")
-            faces.append(triangles + seen)
-            verts.append(own)
+            if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
+                raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(positions)}")
+            faces.append(triangles + n_verts)
+            verts.append(positions)
             colors.append(self.colors(primitive))
-            meshes.append((self._names(node), len(own)))
-            skinned.append(np.full(len(own), "skin" in self.nodes[node] and "JOINTS_0" in primitive["attributes"]))
-            seen += len(own)
-        self._tell_hidden()
+            meshes.append((self._names(node), len(positions)))
+            skinned.append(np.full(len(positions), "skin" in self.nodes[node] and "JOINTS_0" in primitive["attributes"]))
+            n_verts += len(positions)
+        self._warn_of_hidden()
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
-        painted = joined_colors(colors, [len(own) for own in verts])
+        painted = joined_colors(colors, [len(positions) for positions in verts])
         if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
-        bound = np.concatenate(skinned)
+        is_skinned = np.concatenate(skinned)
         triangles = np.vstack(faces)
-        skin, made_of = bound if bound.any() else None, self.origins(triangles)
+        skin, made_of = is_skinned if is_skinned.any() else None, self.origins(triangles)
         return Raw(np.vstack(verts), triangles, painted, skin, tuple(meshes), made_of)
 
     def faces(self) -> Int[Ints, "F 3"]:
-        """The triangles of `scene`, and nothing else of it."""
-        found, seen = [NO_FACES], 0
+        """Read only the triangles of `scene`."""
+        found, n_verts = [NO_FACES], 0
         for node, primitive, place in self.primitives():
-            found.append(self.drawn_triangles(node, primitive, place) + seen)
-            seen += self.count(primitive["attributes"]["POSITION"])
+            found.append(self.drawn_triangles(node, primitive, place) + n_verts)
+            n_verts += self.count(primitive["attributes"]["POSITION"])
         return np.vstack(found)
 
     def origins(self, faces: Int[Ints, "F 3"]) -> tuple[str, ...]:
-        """Hashes of the meshes that this one says it was made of, vertex by vertex, unless its faces are others since."""
+        """Hashes of the meshes that this file records as its vertex-by-vertex sources.
+
+        Empty if there are none, or if the faces have changed since the record was written.
+        """
         extras = self.json["asset"].get("extras")
-        said = extras.get(ORIGINS) if isinstance(extras, dict) else None
-        made_of = said.get("made_of") if isinstance(said, dict) else None
-        if not isinstance(said, dict) or not isinstance(made_of, list) or said.get("faces") != digest(faces):
+        record = extras.get(ORIGINS) if isinstance(extras, dict) else None
+        made_of = record.get("made_of") if isinstance(record, dict) else None
+        if not isinstance(record, dict) or not isinstance(made_of, list) or record.get("faces") != digest(faces):
             return ()
-        return tuple(str(each) for each in made_of[:MOST_ORIGINS])
+        return tuple(str(each) for each in made_of[:MAX_ORIGINS])
 
     def _names(self, number: int) -> tuple[str, ...]:
-        """What a node and its mesh are called."""
+        """Names of a node and of its mesh, without duplicates and empty ones."""
         node = self.nodes[number]
         found = node.get("name"), self.json["meshes"][node["mesh"]].get("name")
         return tuple(dict.fromkeys(plain_text(name) for name in found if isinstance(name, str) and name))
 
-    def _tell_hidden(self) -> None:
-        """Say which meshes are left out because the file hides them."""
+    def _warn_of_hidden(self) -> None:
+        """Warn about meshes that are skipped because the file marks them as invisible."""
         hidden = [node for node in self.world if node in self.hidden and "mesh" in self.nodes[node]]
         if hidden:
             names = ", ".join(dict.fromkeys(next(iter(self._names(node)), f"node {node}") for node in hidden))
             warn(f"{self.name} hides {len(hidden)} of its meshes, which are left out: {names[:200]}")
 
     def primitives(self) -> Iterator[tuple[int, dict[str, Any], Float[Floats, "4 4"]]]:
-        """Node, primitive and where it stands, of all that is drawn but lines, in the order of `scene`."""
-        seen = 0
+        """Yield (node number, primitive, (4, 4) matrix to the scene) of all that is drawn except lines, in scene order."""
+        n_drawn = 0
         for node in self._walk():
             if "mesh" not in self.nodes[node] or node in self.hidden:
                 continue
             for place in self._places(node):
-                seen += 1
-                self._check_many(seen)
+                n_drawn += 1
+                self._check_node_count(n_drawn)
                 for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
-                    seen += 1
-                    self._check_many(seen)
+                    n_drawn += 1
+                    self._check_node_count(n_drawn)
                     drawn = primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN)
-                    if drawn and "POSITION" in primitive.get("attributes", {}):  # else there is nothing to draw
+                    if drawn and "POSITION" in primitive.get("attributes", {}):  # without positions nothing is drawn
                         yield node, primitive, place
 
     def _places(self, number: int) -> Iterator[Float[Floats, "4 4"]]:
-        """Where a node's mesh stands: once, or at each of its instances."""
+        """Yield the (4, 4) matrices to the scene of a node's mesh: one, or one per GPU instance."""
         world = self.world[number]
         given = self.nodes[number].get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
         keys = [key for key in ("TRANSLATION", "ROTATION", "SCALE") if key in given]
         if not keys:
             yield world
             return
-        self._check_many(max(self.count(given[key]) for key in keys))
+        self._check_node_count(max(self.count(given[key]) for key in keys))
         for rows in zip(*(self.accessor(given[key]) for key in keys), strict=True):
             yield world @ local_matrix({key.lower(): row for key, row in zip(keys, rows, strict=True)})
 
-    def _check_many(self, number: int) -> None:
-        if number > MOST_NODES:
-            many = f"the scene of {self.name} has over {MOST_NODES} nodes, or parts of meshes"
-            raise InputError(many, "join its meshes before it is exported")
+    def _check_node_count(self, number: int) -> None:
+        if number > MAX_NODES:
+            message = f"the scene of {self.name} has over {MAX_NODES} nodes, or parts of meshes"
+            raise InputError(message, "join its meshes before it is exported")
 
     def draws_copies(self) -> bool:
-        """Whether a mesh stands in the scene many times, by one node (`INSTANCES`)."""
+        """Whether any node draws several instances of its mesh (`INSTANCES`)."""
         return any(INSTANCES in self.nodes[node].get("extensions", {}) for node, _, _ in self.primitives())
 
     def beyond_triangles(self) -> list[str]:
-        """What there is besides the triangles of one mesh and its material, in words."""
+        """Kinds of content besides the triangles of one mesh with one material, in words ("normals", "skins", ...)."""
         parts = [part for mesh in self.json.get("meshes", []) for part in mesh["primitives"]]
-        there = {
+        present = {
             "nodes": len(self.nodes) > 1,
             "materials": len(self.json.get("materials", [])) > 1,
             "normals": any("NORMAL" in part.get("attributes", {}) for part in parts),
@@ -246,21 +260,21 @@ class Document:
             "clips": bool(self.json.get("animations")),
             "morph targets": any("targets" in part for part in parts),
         }
-        return [word for word, known in there.items() if known]
+        return [word for word, is_present in present.items() if is_present]
 
     def roots(self) -> list[int]:
-        """The topmost nodes of the scene."""
+        """Numbers of the root nodes of the scene."""
         scenes = self.json.get("scenes")
         if scenes:
             return list(scenes[self.json.get("scene", 0)].get("nodes", []))
         return sorted(set(range(len(self.nodes))) - {c for n in self.nodes for c in n.get("children", [])})
 
     def _walk(self) -> list[int]:
-        """Node numbers, depth first, parents before children; fills `world`."""
+        """Return all node numbers depth first, parents before children; fills `world` and `hidden`."""
         self.world, self.hidden = {}, set()
         stack = [(node, np.eye(4)) for node in reversed(self.roots())]
         while stack:
-            self._check_many(len(self.world))
+            self._check_node_count(len(self.world))
             node, parent = stack.pop()
             if node in self.world:
                 raise damaged(self.name, f"node {node} has two parents")
@@ -272,8 +286,8 @@ class Document:
         return list(self.world)
 
     def placed(self, number: int, primitive: dict[str, Any], place: Floats) -> Floats:
-        """(V, 3) positions in the scene."""
-        for extension in primitive.get("extensions", {}):  # there may be plain data as well
+        """(V, 3) positions of a primitive's vertices in scene coordinates; `place` is the matrix of its node or instance."""
+        for extension in primitive.get("extensions", {}):  # uncompressed data may be present as well
             if not _HARMLESS.fullmatch(extension) and not self._has_data(primitive["attributes"]["POSITION"]):
                 raise self._compressed(extension)
         positions = self.accessor(primitive["attributes"]["POSITION"])
@@ -282,13 +296,15 @@ class Document:
     def moved(
         self, number: int, primitive: dict[str, Any], own: Float[Floats, "V 4"], place: Float[Floats, "4 4"]
     ) -> Float[Floats, "V 3"]:
-        """What belongs to the vertices of a primitive, in the scene: positions (fourth number 1) or directions (0), moved by
-        the skin of its node, or else by `place`.
+        """Transform per-vertex vectors of a primitive to scene coordinates.
+
+        `own` are homogeneous vectors: positions (fourth component 1) or directions (0). They are moved by the skin of the
+        node (linear blend skinning), or by `place` where there is no skin or the weights are all 0.
         """
         node = self.nodes[number]
-        hanging = np.asarray(own @ place.T)[:, :3]
+        unskinned = np.asarray(own @ place.T)[:, :3]
         if "skin" not in node or "JOINTS_0" not in primitive["attributes"]:
-            return hanging
+            return unskinned
         bones = self.bones(node["skin"])
         moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
         for joints, weights in self.influences(primitive):
@@ -296,10 +312,10 @@ class Document:
                 weight = weights[:, column : column + 1]
                 moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
                 total += weight
-        return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), hanging)
+        return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), unskinned)
 
     def bones(self, number: int) -> Floats:
-        """(J, 4, 4) where the joints of a skin put what hangs from each."""
+        """(J, 4, 4) skinning matrices of a skin: joint world matrix times inverse bind matrix."""
         if number not in self._bones:
             skin = self.json["skins"][number]
             bones = np.stack([self.world[joint] for joint in skin["joints"]])
@@ -310,7 +326,7 @@ class Document:
         return self._bones[number]
 
     def influences(self, primitive: dict[str, Any]) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
-        """Numbers of joints and their weights for each vertex, four at a time."""
+        """Yield joint numbers (indices into the skin's joints) and their weights per vertex, four at a time."""
         attributes = primitive["attributes"]
         for k in range(8):
             if f"JOINTS_{k}" not in attributes:
@@ -319,7 +335,7 @@ class Document:
             yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
     def mirrors(self, number: int, primitive: dict[str, Any], place: Floats) -> bool:
-        """Whether a node, or most joints of its skin, draws a primitive as in a mirror: its triangles turn over (3.7.4)."""
+        """Whether the node, or most joints of its skin, mirrors a primitive, which flips its triangles (section 3.7.4)."""
         skin = self.nodes[number].get("skin")
         if skin is None or "JOINTS_0" not in primitive["attributes"]:
             return bool(np.linalg.det(place[:3, :3]) < 0)
@@ -328,12 +344,12 @@ class Document:
         return self._mirrors[skin]
 
     def drawn_triangles(self, number: int, primitive: dict[str, Any], place: Floats) -> Int[Ints, "F 3"]:
-        """The triangles of a primitive, counterclockwise from outside in the scene."""
+        """Triangles of a primitive, counterclockwise seen from outside in scene coordinates."""
         found = self.triangles(primitive)
         return found[:, ::-1] if self.mirrors(number, primitive, place) else found
 
     def triangles(self, primitive: dict[str, Any]) -> Int[Ints, "F 3"]:
-        """Those of a primitive as the file has them."""
+        """Triangles of a primitive, oriented as in the file."""
         mode = primitive.get("mode", _TRIANGLES)
         if mode == _POINTS:
             return NO_FACES
@@ -346,7 +362,7 @@ class Document:
         return (fan if mode == _FAN else strips)(corners, np.array([len(corners)]))
 
     def colors(self, primitive: dict[str, Any]) -> Float[Floats, "V 4"] | None:
-        """(V, 4) light and alpha of a primitive's vertices: `COLOR_0` is linear (section 3.9.2)."""
+        """(V, 4) linear RGB and alpha of a primitive's vertices (`COLOR_0`, section 3.9.2); None if there are none."""
         if "COLOR_0" not in primitive["attributes"]:
             return None
         values = self.accessor(primitive["attributes"]["COLOR_0"])
@@ -358,39 +374,39 @@ class Document:
         return any(key in self.json["accessors"][number] for key in ("bufferView", "sparse"))
 
     def count(self, number: int) -> int:
-        """How many values an accessor has."""
+        """Number of elements of an accessor."""
         return int(self.json["accessors"][number]["count"])
 
     def accessor(self, number: int, whole: bool = False) -> Float[Floats, "count width"]:
-        """(count, width) values; whole numbers that stand for 0..1 or -1..1 are divided unless `whole`."""
+        """(count, width) values of an accessor; normalized integers are scaled to 0..1 or -1..1 unless `whole`."""
         accessor = self.json["accessors"][number]
         count, width = int(accessor["count"]), WIDTHS[accessor["type"]]
         kind = np.dtype(COMPONENTS[accessor["componentType"]])
         if "bufferView" in accessor:
             values = self._view(accessor, count, width, kind)
-        else:  # zeros, then filled sparsely
-            if self._bound is None:
-                held = [k for k in range(len(self.json.get("buffers", []))) if self._held(k)]
-                self._bound = sum(len(self.buffer(k)) for k in held)
-            if not 0 <= count <= max(self._bound, 1):
+        else:  # a sparse accessor without base values starts from zeros
+            if self._sparse_limit is None:
+                with_data = [k for k in range(len(self.json.get("buffers", []))) if self._has_buffer(k)]
+                self._sparse_limit = sum(len(self.buffer(k)) for k in with_data)
+            if not 0 <= count <= max(self._sparse_limit, 1):
                 raise damaged(self.name, f"it promises {count} values that it does not hold")
             values = np.zeros((count, width), kind)
         if "sparse" in accessor:
             sparse = accessor["sparse"]
-            where, many = sparse["indices"], int(sparse["count"])
-            rows = self._view(where, many, 1, np.dtype(COMPONENTS[where["componentType"]]))
+            where, n_sparse = sparse["indices"], int(sparse["count"])
+            rows = self._view(where, n_sparse, 1, np.dtype(COMPONENTS[where["componentType"]]))
             values = values.copy()
-            values[rows[:, 0]] = self._view(sparse["values"], many, width, kind)
+            values[rows[:, 0]] = self._view(sparse["values"], n_sparse, width, kind)
         out = values.astype(np.float64)
         if accessor.get("normalized") and not whole and kind.kind in "iu":
             out = np.maximum(out / np.iinfo(kind).max, -1.0)
         return out
 
     def _view(self, entry: dict[str, Any], count: int, width: int, kind: np.dtype[Any]) -> NDArray[Any]:
-        """(count, width) values from the place in a buffer view that an entry names."""
+        """(count, width) values at the buffer view and byte offset that an accessor entry refers to."""
         view, offset = self.json["bufferViews"][entry["bufferView"]], entry.get("byteOffset", 0)
         for extension in COMPRESSED:
-            if extension in view.get("extensions", {}) and not self._held(view["buffer"]):
+            if extension in view.get("extensions", {}) and not self._has_buffer(view["buffer"]):
                 raise self._compressed(extension)
         data = self.buffer(view["buffer"])
         start = view.get("byteOffset", 0) + offset
@@ -402,18 +418,18 @@ class Document:
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
     def view_bytes(self, number: int) -> bytes:
-        """All bytes of a buffer view, as an image has them."""
+        """All bytes of a buffer view, such as an encoded image."""
         size = int(self.json["bufferViews"][number]["byteLength"])
         return self._view({"bufferView": number}, size, 1, np.dtype("u1")).tobytes()
 
-    def _held(self, number: int) -> bool:
-        """Whether the data of a buffer is anywhere: that of plain data beside compressed need not be."""
+    def _has_buffer(self, number: int) -> bool:
+        """Whether a buffer has data: the fallback buffer of a compressed file may have none."""
         buffer = self.json["buffers"][number]
         fallback = any(buffer.get("extensions", {}).get(each, {}).get("fallback") for each in COMPRESSED)
         return "uri" in buffer or (number == 0 and bool(self.body) and not fallback)
 
     def buffer(self, number: int) -> bytes:
-        """The data of a buffer; `InputError` where it is missing."""
+        """Return the data of a buffer; `InputError` if it is missing."""
         if number not in self.buffers:
             uri = self.json["buffers"][number].get("uri")
             if uri is None and number:
@@ -423,10 +439,10 @@ class Document:
         return self.buffers[number]
 
     def resource(self, uri: str) -> bytes:
-        """What a URI names: data within it, or a file in the folder of this one."""
+        """Return the bytes of a URI: embedded data, or a file in the folder of the glTF file."""
         if embedded(uri):
             try:
-                return _data_of(uri)
+                return _decode_data_uri(uri)
             except (binascii.Error, ValueError) as error:
                 raise damaged(self.name, "its embedded data is not base64") from error
         file = beside(self.path.parent, uri, uri=True)
@@ -437,12 +453,12 @@ class Document:
 
 
 def embedded(uri: str) -> bool:
-    """Whether a URI holds its data itself."""
+    """Whether a URI embeds its data (`data:`)."""
     return uri[:5].lower() == "data:"
 
 
-def _data_of(uri: str) -> bytes:
-    """The data of a URI: base64, also without padding and in the alphabet of URLs, or else plain bytes."""
+def _decode_data_uri(uri: str) -> bytes:
+    """Decode a data URI: base64 (padding optional, standard or URL-safe alphabet), or percent-encoded bytes."""
     kind, comma, text = uri[5:].partition(",")
     if not comma:
         raise ValueError("it has no comma")
@@ -454,7 +470,7 @@ def _data_of(uri: str) -> bytes:
 
 
 def local_matrix(node: dict[str, Any]) -> Floats:
-    """(4, 4) matrix of a node: given by columns, or translation, rotation (x y z w) and scale."""
+    """(4, 4) local matrix of a node: its column-major `matrix`, or its translation, rotation (x y z w) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)

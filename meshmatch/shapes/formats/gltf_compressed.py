@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import check_places, damaged
+from meshmatch.shapes.formats import check_element_count, damaged
 from meshmatch.shapes.input_files import check_memory
 
 DRACO = "KHR_draco_mesh_compression"
@@ -119,7 +119,7 @@ def _jobs(
         corners += sizes.get("indices", 0)
     if min(promised, default=0) < 0:
         raise damaged(name, "it promises a negative count")
-    check_places(name, size, vertices, corners // 3)
+    check_element_count(name, size, vertices, corners // 3)
     check_memory(name, size, 4 * sum(promised))
     check_memory(name, size, 3 * sum(length for _, _, length in pieces))
     return jobs, list(pieces)

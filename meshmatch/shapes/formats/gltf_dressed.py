@@ -17,7 +17,7 @@ from meshmatch.geometry.triangles import unit
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats.gltf import COMPRESSED, Document
-from meshmatch.shapes.formats.gltf_attributes import laid_out, transform_of
+from meshmatch.shapes.formats.gltf_attributes import base_color_uv, transform_of
 from meshmatch.shapes.formats.gltf_edit import Editor, drawn
 from meshmatch.shapes.formats.gltf_out import VERTICES, smooth_normals
 from meshmatch.shapes.formats.gltf_prune import textures_in
@@ -68,7 +68,7 @@ def dressed(
                 continue
             primitive = mesh["primitives"][k]
             V = document.count(part["attributes"]["POSITION"])
-            laid = (np.arange(V), laid_out(document, part), faces) if own else split_at_seams(V, faces, corners)
+            laid = (np.arange(V), base_color_uv(document, part), faces) if own else split_at_seams(V, faces, corners)
             kept = own and not transform_of(document, part)
             moved_to = None if kept else _lay(editor, document, V, primitive, laid)
             _untint(document, part, primitive)
@@ -123,7 +123,7 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
 def _stored(document: Document) -> Floats:
     """All first texture coordinates of a scene."""
     parts = [part for parts in drawn(document).values() for part in parts.values()]
-    found = [laid_out(document, part) for part in parts if "TEXCOORD_0" in part["attributes"]]
+    found = [base_color_uv(document, part) for part in parts if "TEXCOORD_0" in part["attributes"]]
     return np.concatenate([np.empty((0, 2)), *found])
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import gltf_vrm
-from meshmatch.shapes.formats.gltf import INSTANCES, MOST_ORIGINS, ORIGINS, Document, digest, embedded
+from meshmatch.shapes.formats.gltf import INSTANCES, MAX_ORIGINS, ORIGINS, Document, digest, embedded
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS
 from meshmatch.shapes.formats.gltf_out import INDICES, TYPES, VERTICES, packed
 from meshmatch.shapes.formats.gltf_prune import prune, unused
@@ -209,7 +209,7 @@ def remembering(glb: bytes, of: Shape) -> bytes:
         return glb
     editor = Editor(document)
     asset = editor.json["asset"]
-    said = {"made_of": [of.hash, *of.made_of][:MOST_ORIGINS], "faces": digest(faces)}
+    said = {"made_of": [of.hash, *of.made_of][:MAX_ORIGINS], "faces": digest(faces)}
     asset["extras"] = (asset["extras"] if isinstance(asset.get("extras"), dict) else {}) | {ORIGINS: said}
     return editor.to_bytes()
 

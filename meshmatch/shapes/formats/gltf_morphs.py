@@ -17,7 +17,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import shortest_turns, unit
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip, shape_normals
-from meshmatch.shapes.formats import check_places, gltf_vrm
+from meshmatch.shapes.formats import check_element_count, gltf_vrm
 from meshmatch.shapes.formats.gltf import Document, understood
 from meshmatch.shapes.formats.gltf_edit import Editor, drawn, frames_of
 from meshmatch.shapes.shape import Shape
@@ -96,7 +96,7 @@ def _morphs(document: Document) -> BlendShapes:
         hint = "export it with its blendshapes, or give them as files: --shapes FOLDER"
         raise InputError(f"{document.name} has no blendshapes (morph targets)", hint)
     counts = [document.count(part["attributes"]["POSITION"]) for _, part, _ in parts]
-    check_places(document.name, document.size, len(names) * sum(counts) // 4)
+    check_element_count(document.name, document.size, len(names) * sum(counts) // 4)
     moves = np.zeros((len(names), sum(counts), 3), np.float32)
     seen, normals = 0, True
     for (number, part, place), count in zip(parts, counts, strict=True):

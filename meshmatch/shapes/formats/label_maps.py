@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError
 from meshmatch.shapes.companions import beside
-from meshmatch.shapes.formats import Raw, damaged, numbers
+from meshmatch.shapes.formats import Raw, damaged, parse_numbers
 from meshmatch.shapes.formats.label_surfaces import CODE_BYTES, label_surfaces
 from meshmatch.shapes.input_files import check_memory, read_bytes, suffix_of
 
@@ -276,7 +276,7 @@ def _unpacker(name: str, encoding: str, content: bytes, kind: str) -> Callable[[
     if encoding in ("gzip", "gz", "bzip2", "bz2"):
         return lambda need: _unpacked(content, need, "gzip" if encoding[0] == "g" else "bz2")
     if encoding in ("ascii", "text", "txt"):
-        return lambda need: numbers(name, content).astype(kind).tobytes()[:need]
+        return lambda need: parse_numbers(name, content).astype(kind).tobytes()[:need]
     raise InputError(f"{name} is packed by {encoding[:20]}", "save it uncompressed, or by gzip")
 
 

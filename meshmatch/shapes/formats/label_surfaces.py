@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.formats import NO_FACES, Raw, check_places
+from meshmatch.shapes.formats import NO_FACES, Raw, check_element_count
 from meshmatch.shapes.input_files import check_memory
 
 CODE_BYTES = 3
@@ -85,7 +85,7 @@ def label_surfaces(
             inside = codes[box] == code + 1
             crossed = sum(int(np.count_nonzero(np.diff(inside, axis=axis))) for axis in range(3))
             many += crossed
-            check_places(name, size, many, 2 * many)
+            check_element_count(name, size, many, 2 * many)
             points, own = _net(inside)
             if len(points) == 0:
                 continue

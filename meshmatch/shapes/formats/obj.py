@@ -14,7 +14,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
-from meshmatch.shapes.formats import Raw, columns, damaged, numbers, words_per_line
+from meshmatch.shapes.formats import Raw, columns, damaged, parse_numbers, words_per_line
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
@@ -43,17 +43,19 @@ def read(path: Path, data: bytes) -> Raw:
     check_text(name, data)
     data = joined_lines(data)
     text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, data, b"v")
-    formats.check_places(name, len(data), len(vertex_lines), max(int(sizes.sum()) - 2 * len(sizes), 0), text=True)
+    formats.check_element_count(
+        name, len(data), len(vertex_lines), max(int(sizes.sum()) - 2 * len(sizes), 0), text=True
+    )
     if len(vertex_lines) == 0:
         raise InputError(f"{name} holds no vertices: it has no 'v' lines", formats.NO_MESH)
     counts = words_per_line(text)
     if len(counts) < len(vertex_lines) or counts.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
-    values = numbers(name, text)
+    values = parse_numbers(name, text)
     verts = columns(values, counts, 0, 3)
     corner = vertices_of_corners(name, faces_text, sizes, vertex_lines, face_lines)
     faces = corner[triangles_of(name, verts, corner, sizes)]
-    formats.tell_lost_faces(name, len(sizes), faces)
+    formats.warn_if_no_triangles(name, len(sizes), faces)
     return Raw(verts, faces, _colors(name, data, values, counts))
 
 
@@ -63,7 +65,7 @@ def vertices_of_corners(
     """The vertex, from 0, at each corner of all faces, which are as `entries_and_faces` finds them."""
     if b"/" in faces:
         faces = re.sub(rb"/\S*", b"", faces)  # position/texture/normal: the first alone
-    corners = numbers(name, faces)
+    corners = parse_numbers(name, faces)
     if len(corners) != sizes.sum():
         raise damaged(name, "a corner of a face has no vertex before its slash")
     if (corners == 0).any():
@@ -103,17 +105,19 @@ def _colors(name: str, data: bytes, values: Floats, counts: Ints) -> Floats | No
         return colors
     if b"#MRGB" in data:
         # Eight digits a vertex: mask, red, green, blue. The mask says what ZBrush may change, and is no part of the look.
-        rows = formats.lines_of(data, b"#MRGB")[0][0].split()
+        rows = formats.lines_starting_with(data, b"#MRGB")[0][0].split()
         if not all(map(_POLYPAINT.fullmatch, rows)):
             warn(f"{name} has polypaint (#MRGB) that is not of eight hexadecimal digits a vertex; it is left out")
             return None
         masked = np.frombuffer(bytes.fromhex(b"".join(rows).decode()), np.uint8).reshape(-1, 4)
         return _for_all(name, "polypaint (#MRGB)", masked[:, 1:] / 255.0, len(counts))
     if b"\nvc " in data:
-        [(text, lines)] = formats.lines_of(formats.without_comments(data), b"vc")
+        [(text, lines)] = formats.lines_starting_with(formats.without_comments(data), b"vc")
         own = words_per_line(text)
         if len(own) == len(lines) and len(own) and own.min() >= 3:
-            return _for_all(name, "colors (vc)", formats.painted(columns(numbers(name, text), own, 0, 3)), len(counts))
+            return _for_all(
+                name, "colors (vc)", formats.painted(columns(parse_numbers(name, text), own, 0, 3)), len(counts)
+            )
     return None
 
 
@@ -135,7 +139,7 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
     Faces of the old spelling ``fo`` come last.
     """
     data = formats.without_comments(data)
-    (text, listed), (faces, lines), (old, old_lines) = formats.lines_of(data, word, b"f", b"fo")
+    (text, listed), (faces, lines), (old, old_lines) = formats.lines_starting_with(data, word, b"f", b"fo")
     if len(old_lines):
         faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
     if b" /" in faces or b"\t/" in faces:  # 1 / 2 is the corner 1/2

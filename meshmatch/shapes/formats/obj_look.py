@@ -19,7 +19,7 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Alpha, Appearance, Finish, ImageReader, Layer, Material, Pixels, Wrap
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.companions import beside, folded
-from meshmatch.shapes.formats import DECIMAL_COMMA, columns, damaged, lines_of, numbers, words_per_line
+from meshmatch.shapes.formats import DECIMAL_COMMA, columns, damaged, lines_starting_with, parse_numbers, words_per_line
 from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
@@ -169,7 +169,7 @@ class _Worn:
 
 
 def _worn(path: Path, data: bytes, shape: Shape, libraries_too: bool) -> _Worn:
-    named, libraries = (_words(*found) for found in lines_of(data, b"usemtl", b"mtllib"))
+    named, libraries = (_words(*found) for found in lines_starting_with(data, b"usemtl", b"mtllib"))
     corners, laid, lines = _coordinates(path.name, data, shape)
     names = list(dict.fromkeys(name for name, _ in named))
     place = {name: k for k, name in enumerate(names)}
@@ -220,7 +220,7 @@ def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
     """
     found: dict[Path, None] = {}
     missing: dict[str, None] = {}
-    [libraries] = lines_of(joined_lines(data), b"mtllib")
+    [libraries] = lines_starting_with(joined_lines(data), b"mtllib")
     for name, _ in _words(*libraries):
         whole = beside(path.parent, name)
         files = [whole] if whole is not None else _named(path.parent, _uncommented(name))
@@ -268,14 +268,14 @@ def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, I
     pairs = np.zeros((len(vt_lines), 2))
     if len(vt_lines):
         width = int(min(counts.min(), 2))
-        pairs[:, :width] = columns(numbers(name, text), counts, 0, width)
+        pairs[:, :width] = columns(parse_numbers(name, text), counts, 0, width)
     index = np.zeros(int(sizes.sum()), np.int64)
     if b"/" in faces:
-        values = numbers(name, second_index(faces))
+        values = parse_numbers(name, second_index(faces))
         index = from_one(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
     vertices = index
     if (sizes > 3).any():  # how polygons are split, depends on where their vertices are
-        [(_, v_lines)] = lines_of(data, b"v")
+        [(_, v_lines)] = lines_starting_with(data, b"v")
         vertices = vertices_of_corners(name, faces, sizes, v_lines, face_lines)
     triangles = index[triangles_of(name, shape.verts_or_nan, vertices, sizes)]
     laid = np.asarray((triangles > 0).all(axis=1))

@@ -14,7 +14,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import unit
-from meshmatch.shapes.formats import columns, lines_of, numbers, without_comments, words_per_line
+from meshmatch.shapes.formats import columns, lines_starting_with, parse_numbers, without_comments, words_per_line
 from meshmatch.shapes.formats.obj import SLASH_APART, entries_and_faces, from_one, joined_lines, vertices_of_corners
 from meshmatch.shapes.formats.polygons import triangles_of
 
@@ -149,7 +149,7 @@ def beyond_triangles(name: str, data: bytes) -> list[str]:
     """What a text has besides the triangles of one mesh and its material, in words."""
     data = joined_lines(data)
     normals, _, sizes = entries_and_faces(name, data, b"vn")[1:4]
-    groups, objects, materials = lines_of(without_comments(data), b"g", b"o", b"usemtl")
+    groups, objects, materials = lines_starting_with(without_comments(data), b"g", b"o", b"usemtl")
     there = {
         "polygons": bool(len(sizes)) and int(sizes.max()) > 3,
         "groups": len(groups[1]) + len(objects[1]) > 1,
@@ -194,13 +194,13 @@ def _turned_normals(name: str, data: bytes, turns: Float[Floats, "V 3 3"]) -> Fl
     counts = words_per_line(text)
     if len(counts) < len(lines) or (len(counts) and counts.min() < 3):
         return np.empty((0, 3))
-    normals = columns(numbers(name, text), counts, 0, 3)
+    normals = columns(parse_numbers(name, text), counts, 0, 3)
     vertex_lines = entries_and_faces(name, data, b"v")[1]
     vertices = vertices_of_corners(name, faces, sizes, vertex_lines, face_lines)
     third: Ints = from_one(
         name,
         "normal",
-        numbers(name, _UP_TO_NORMAL.sub(b"", _WITHOUT_NORMAL.sub(b"0", faces))),
+        parse_numbers(name, _UP_TO_NORMAL.sub(b"", _WITHOUT_NORMAL.sub(b"0", faces))),
         lines,
         np.repeat(face_lines, sizes),
     )

@@ -10,7 +10,7 @@ import numpy as np
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
-from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
+from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, parse_numbers, words_per_line
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import check_text
 from meshmatch.shapes.shape import Shape
@@ -39,14 +39,14 @@ def read(path: Path, data: bytes) -> Raw:
     body = body[head.end() :]
     if len(body) < V + F:  # a row takes two bytes and more
         raise damaged(name, f"{promise} is only {len(data)} bytes long")
-    formats.check_places(name, len(data), V, F, text=True)
+    formats.check_element_count(name, len(data), V, F, text=True)
     counts = words_per_line(body)
     if len(counts) < V + F:
         raise damaged(name, f"{promise} has only {len(counts)} lines of them")
     widths, sizes = counts[:V], counts[V : V + F]
     if V and widths.min() < 3:
         raise damaged(name, "a vertex has fewer than 3 coordinates")
-    rows, faces = np.split(numbers(name, body), [widths.sum()])
+    rows, faces = np.split(parse_numbers(name, body), [widths.sum()])
     colors = _colors(kind, rows, widths)
     verts = columns(rows, widths, 0, 3) if V else np.empty((0, 3))
     if F == 0:
@@ -56,10 +56,10 @@ def read(path: Path, data: bytes) -> Raw:
     if not ((corners >= 0) & (corners < sizes)).all():
         raise damaged(name, "a face has fewer corners than it says")
     many = corners.astype(np.int64)
-    formats.check_places(name, len(data), V, max(int(many.sum()) - 2 * F, 0), text=True)
+    formats.check_element_count(name, len(data), V, max(int(many.sum()) - 2 * F, 0), text=True)
     corner = formats.indices(name, faces[formats.runs(starts + 1, many)])
     triangles = corner[triangles_of(name, verts, corner, many)]
-    formats.tell_lost_faces(name, F, triangles)
+    formats.warn_if_no_triangles(name, F, triangles)
     found = None if colors is not None else _face_colors(faces, starts + 1 + many, sizes - 1 - many)
     if found is not None and len(triangles):
         warn(f"{name} has colors of faces: each vertex gets the mean of those around it")

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
-from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, numbers, words_per_line
+from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, parse_numbers, words_per_line
 from meshmatch.shapes.input_files import check_text, read_npy
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_npy
@@ -35,7 +35,7 @@ def read_xyz(path: Path, data: bytes) -> Raw:
     text, labels = _without_header(text)
     text = _split_by_spaces(name, text)
     counts = words_per_line(text)
-    formats.check_places(name, len(data), len(counts), text=True)
+    formats.check_element_count(name, len(data), len(counts), text=True)
     if len(counts) > 1 and counts[0] == 1 and counts[1:].min() >= 3 and text.split(None, 1)[0].isdigit():
         promised, text = text.split(None, 1)  # a first line with the number of points
         counts = counts[1:]
@@ -51,7 +51,7 @@ def read_xyz(path: Path, data: bytes) -> Raw:
     if counts.min() < least:
         short = int(np.flatnonzero(counts < least)[0])
         raise damaged(name, f"point {short} has only {int(counts[short])} of {least} coordinates")
-    return Raw(columns(numbers(name, text), counts, 0, least)[:, places], NO_FACES)
+    return Raw(columns(parse_numbers(name, text), counts, 0, least)[:, places], NO_FACES)
 
 
 def _without_header(text: bytes) -> tuple[bytes, list[bytes]]:
@@ -108,7 +108,7 @@ def read_points(path: Path, data: bytes) -> Raw:
     if array.ndim != 2 or array.shape[1] not in (3, 6):
         hint = "points are an array of (N, 3), or (N, 6)"
         raise InputError(f"{path.name} holds an array of {array.shape}, not a point cloud", hint)
-    formats.check_places(path.name, len(data), len(array))
+    formats.check_element_count(path.name, len(data), len(array))
     return Raw(np.array(array[:, :3], np.float64), NO_FACES)
 
 

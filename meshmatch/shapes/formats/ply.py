@@ -19,12 +19,12 @@ from meshmatch.shapes.formats import (
     NO_MESH,
     WRONG_SUFFIX,
     Raw,
-    check_places,
+    check_element_count,
     colors_of_faces,
     damaged,
     indices,
     strips,
-    tell_lost_faces,
+    warn_if_no_triangles,
 )
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
 from meshmatch.shapes.formats.polygons import triangles_of
@@ -74,7 +74,7 @@ def read(path: Path, data: bytes) -> Raw:
     joined = np.concatenate([NO_FACES, *faces])
     for other in content.unread:
         warn(f"{name}: its {other.count} {other.name} are not read; faces should be an element face")
-    tell_lost_faces(name, sum(element.count for element in [*content.faces, *content.strips]), joined)
+    warn_if_no_triangles(name, sum(element.count for element in [*content.faces, *content.strips]), joined)
     for (corners, sizes), element in zip(lists, content.faces, strict=True) if colors is None else ():
         painted = _colors(element)
         if painted is not None and len(painted):
@@ -93,7 +93,7 @@ def parsed(name: str, data: bytes) -> Content:
         raise InputError(f"{name}: the header declares no vertices", NO_MESH)
     promised = sum(each.count for each in elements if each.role in ("vertex", "face") and each.properties)
     if promised < len(data):  # else it is told as damage, below
-        check_places(name, len(data), promised, text=order is None)
+        check_element_count(name, len(data), promised, text=order is None)
     body = Body(name, data, start, order)
     last = max(k for k, element in enumerate(elements) if element.role)
     for element in elements[: last + 1]:
@@ -160,7 +160,7 @@ def read_pcd(path: Path, data: bytes) -> Raw:
         body = Body(name, data, start.end(), None if start[1] == b"ascii" else "<")
         held = body.rows_left(points)
         points.count = held if held and (promised <= 0 or promised > held or grid == held) else promised
-        check_places(name, len(data), points.count)
+        check_element_count(name, len(data), points.count)
         points.table = body.element(points)
         verts = np.stack([points.table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (KeyError, ValueError, IndexError) as error:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import FEW_PLACES, damaged, indices, numbers, runs
+from meshmatch.shapes.formats import BASE_ELEMENTS, damaged, indices, parse_numbers, runs
 from meshmatch.shapes.input_files import check_text
 
 TYPES = {
@@ -50,10 +50,10 @@ class Body:
     def __init__(self, name: str, data: bytes, start: int, order: str | None) -> None:
         self.name, self.at, self.order, self.text = name, start, order or "=", order is None
         self.data: Any = data
-        self.most = 3 * (FEW_PLACES + len(data) // (24 if self.text else 12))  # corners of faces
+        self.most = 3 * (BASE_ELEMENTS + len(data) // (24 if self.text else 12))  # corners of faces
         if self.text:
             check_text(name, data)
-            self.data, self.at = numbers(name, data[start:]).view(np.uint8).data, 0
+            self.data, self.at = parse_numbers(name, data[start:]).view(np.uint8).data, 0
 
     def element(self, element: Element) -> dict[str, Any]:
         """By property: its numbers, or, of lists, all their items (whole numbers unless declared as floats) and the size of

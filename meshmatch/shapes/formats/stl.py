@@ -18,11 +18,11 @@ from meshmatch.shapes.formats import (
     WRONG_SUFFIX,
     Raw,
     as_float32,
-    check_places,
+    check_element_count,
     damaged,
     fan,
-    lines_of,
-    numbers,
+    lines_starting_with,
+    parse_numbers,
     words_per_line,
 )
 from meshmatch.shapes.input_files import check_text
@@ -57,7 +57,7 @@ def _promised(data: bytes) -> int:
 
 def _binary(name: str, data: bytes) -> Float[Floats, "V 3"]:
     held, promised = max(len(data) - _HEADER, 0) // _ROW, _promised(data)
-    check_places(name, len(data), 0, 4 * held)
+    check_element_count(name, len(data), 0, 4 * held)
     if not held:
         raise damaged(name, "none of its triangles is whole, or it is not an stl file")
     corners = np.frombuffer(data, _ROWS, held, _HEADER)["corners"].astype(np.float64)
@@ -93,15 +93,15 @@ def _likely(corners: Float[Floats, "F 3 3"]) -> Bools:
 def _text(name: str, data: bytes) -> Float[Floats, "V 3"]:
     check_text(name, data)
     text = _NAMES.sub(rb"\1", data.replace(b"\r", b"\n").lower())
-    check_places(name, len(data), text.count(b"vertex") * 4 // 3, text=True)
+    check_element_count(name, len(data), text.count(b"vertex") * 4 // 3, text=True)
     if b"vertex" not in text:
         raise InputError(f"{name} holds no triangles, or it is not an stl file", WRONG_SUFFIX)
-    if text.count(b"vertex") != len(lines_of(text, b"vertex")[0][1]):  # several on a line
+    if text.count(b"vertex") != len(lines_starting_with(text, b"vertex")[0][1]):  # several on a line
         text = _WORDS.sub(b"\n", text)
     ended = bool(_END.search(text))
     if not ended:  # the last number may be cut short
         text = text[: text.rfind(b"\n") + 1]
-    (vertices, where), (_, begins) = lines_of(text, b"vertex", b"facet")
+    (vertices, where), (_, begins) = lines_starting_with(text, b"vertex", b"facet")
     counts = words_per_line(vertices)
     if len(counts) != len(where) or (counts != 3).any():
         raise damaged(name, "its triangles cannot be read: a vertex has other than 3 coordinates")
@@ -115,7 +115,7 @@ def _text(name: str, data: bytes) -> Float[Floats, "V 3"]:
         raise damaged(name, "none of its triangles is whole")
     if not ended:
         warn(f"{name} has no end: it may be cut short; {len(sizes)} whole triangles are read")
-    verts = numbers(name, vertices).reshape(-1, 3)
+    verts = parse_numbers(name, vertices).reshape(-1, 3)
     return np.asarray(verts[fan(np.arange(int(sizes.sum())), sizes)]).reshape(-1, 3)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import WRONG_SUFFIX, Raw, check_places, damaged, indices, numbers
+from meshmatch.shapes.formats import WRONG_SUFFIX, Raw, check_element_count, damaged, indices, parse_numbers
 from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
 from meshmatch.shapes.shape import Shape
 
@@ -76,10 +76,10 @@ class _File:
                     raise InputError(f"{self.name} holds {what}, not a surface", "save a surface: PolyData")
             elif word == b"POINTS":
                 count = self._count(rest, 0)
-                check_places(self.name, len(self.data), count, text=not self.binary)
+                check_element_count(self.name, len(self.data), count, text=not self.binary)
                 verts = self._array(3 * count, rest[1:]).reshape(-1, 3).astype(np.float64)
             elif word in _CELLS:
-                check_places(self.name, len(self.data), len(verts), self._count(rest, 0), text=not self.binary)
+                check_element_count(self.name, len(self.data), len(verts), self._count(rest, 0), text=not self.binary)
                 corners, sizes = self._cells(self._count(rest, 0), self._count(rest, 1))
                 cells.append(Cells(corners, sizes, np.full(len(sizes), _CELLS[word] or 7)))
             elif word == b"CELL_TYPES":
@@ -145,7 +145,7 @@ class _File:
         if not self.binary:
             found = _KEYWORD.search(self.data, self.at - 1)
             end = found.start() if found else len(self.data)
-            values = numbers(self.name, self.data[self.at : end])
+            values = parse_numbers(self.name, self.data[self.at : end])
             self.at = end
             if len(values) < count:
                 raise damaged(self.name, f"it has {len(values)} numbers where {count} should be")

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
-from meshmatch.shapes.formats import Raw, check_places, damaged, runs, strips, tell_lost_faces
+from meshmatch.shapes.formats import Raw, check_element_count, damaged, runs, strips, warn_if_no_triangles
 from meshmatch.shapes.formats.polygons import triangles_of
 
 _POINTS, _LINES = (0, 1, 2), (3, 4, 21)
@@ -42,7 +42,7 @@ def raw_of(
         if (each.sizes < 0).any() or each.sizes.sum() > len(each.corners):
             raise damaged(name, "a cell has fewer points than it says")
         made += max(int(each.sizes.sum()) - 2 * len(each.sizes), 0)
-        check_places(name, size, len(verts), made)
+        check_element_count(name, size, len(verts), made)
         known = np.isin(each.kinds, (*_POINTS, *_LINES, *_POLYGONS, _STRIP, _PIXEL))
         if not known.all():
             kind = int(each.kinds[~known][0])
@@ -68,5 +68,5 @@ def raw_of(
                 corners = corners.reshape(-1, 4)[:, [0, 1, 3, 2]].ravel()
             triangles.append(corners[triangles_of(name, verts, corners, sizes)])
     found = np.concatenate(triangles)
-    tell_lost_faces(name, listed, found)
+    warn_if_no_triangles(name, listed, found)
     return Raw(verts, found, colors)

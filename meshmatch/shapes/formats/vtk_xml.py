@@ -24,14 +24,14 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import (
-    FEW_PLACES,
+    BASE_ELEMENTS,
     WRONG_SUFFIX,
     Raw,
-    check_places,
+    check_element_count,
     damaged,
     joined_colors,
-    numbers,
     painted,
+    parse_numbers,
 )
 from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
 from meshmatch.shapes.input_files import read_bytes
@@ -148,7 +148,7 @@ class _File:
         faces = sum(
             _count(self.name, piece, f"NumberOf{what}") for piece in pieces for what in ("Polys", "Strips", "Cells")
         )
-        check_places(self.name, self.size, sum(counts), faces)
+        check_element_count(self.name, self.size, sum(counts), faces)
         self.points, self.triangles = sum(counts), 0
         verts, colors, cells, first = [np.zeros((0, 3))], [], [], 0
         for piece, count in zip(pieces, counts, strict=True):
@@ -182,7 +182,7 @@ class _File:
 
     def _may_unpack(self) -> None:
         """So many bytes from now on."""
-        self.left = 64 * (FEW_PLACES + self.size // 12)
+        self.left = 64 * (BASE_ELEMENTS + self.size // 12)
 
     def _cells(self, piece: ElementTree.Element) -> list[Cells]:
         found = []
@@ -199,7 +199,7 @@ class _File:
                 raise damaged(self.name, "it does not say of what kind its cells are")
             sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
             self.triangles += max(int(sizes.sum()) - 2 * many, 0)
-            check_places(self.name, self.size, self.points, self.triangles)
+            check_element_count(self.name, self.size, self.points, self.triangles)
             corners = corners[: max(int(sizes.sum()), 0)]
             found.append(Cells(corners.astype(np.int64), sizes, kinds.astype(np.int64)))
         return found
@@ -225,7 +225,7 @@ class _File:
             raise damaged(self.name, f"numbers of the unknown type {str(element.get('type'))[:40]}")
         form, text = element.get("format", "ascii"), (element.text or "").strip().encode()
         if form == "ascii":
-            return numbers(self.name, text)
+            return parse_numbers(self.name, text)
         try:
             if form == "appended":
                 at = int(str(element.get("offset")))
