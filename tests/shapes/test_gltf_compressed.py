@@ -121,7 +121,7 @@ def test_what_is_written_of_it_needs_no_library(tmp_path: Path, make: Any, monke
 def test_weights_sum_to_one_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounded to few bits they do not."""
     rounded = {"0 WEIGHTS_0": np.float32([[0.5, 0.25, 0, 0]]), "0 WEIGHTS_1": np.float32([[0.5, 0, 0, 0]])}
-    monkeypatch.setattr(gltf_compressed, "_decoded", lambda *_: rounded)
+    monkeypatch.setattr(gltf_compressed, "_decode_in_subprocess", lambda *_: rounded)
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: True)
     ids = {"WEIGHTS_0": 0, "WEIGHTS_1": 1}
     primitive = {"attributes": dict(ids), "extensions": {DRACO: {"bufferView": 0, "attributes": ids}}}
@@ -162,7 +162,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, document: dict[str, Any], size: int =
         questions.append((jobs, data))
         return {f"{k} {name}": np.zeros(n, "f4") for k, job in enumerate(jobs) for name, n in job["sizes"].items()}
 
-    monkeypatch.setattr(gltf_compressed, "_decoded", answer)
+    monkeypatch.setattr(gltf_compressed, "_decode_in_subprocess", answer)
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: True)
     gltf_compressed.decompress("a.glb", size, document, lambda _: b"1" * size, {DRACO})
     return questions

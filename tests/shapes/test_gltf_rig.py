@@ -106,11 +106,11 @@ def test_a_damaged_target_is_told_in_a_line(tmp_path: Path, damage: Damage) -> N
 def test_joints_and_keys_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "tube.gltf"
     write_tube(path)
-    monkeypatch.setattr(gltf_rig, "MOST_JOINTS", 3)
+    monkeypatch.setattr(gltf_rig, "MAX_JOINTS", 3)
     with pytest.raises(InputError, match="has 4 joints, of 3 at most"):
         read_rig(path, path.read_bytes())
-    monkeypatch.setattr(gltf_rig, "MOST_JOINTS", 4)
-    monkeypatch.setattr(gltf_rig, "_FEW_KEYS", -100_000)
+    monkeypatch.setattr(gltf_rig, "MAX_JOINTS", 4)
+    monkeypatch.setattr(gltf_rig, "_BASE_KEYS", -100_000)
     many = [{"sampler": 0, "target": {"node": 3, "path": "rotation"}}] * 10_000
     changed(path, lambda document: document["animations"][0].update(channels=many))
     with pytest.raises(InputError, match="many of them shared"):

@@ -165,7 +165,7 @@ def test_gltf_of_one_mesh_many_times(tmp_path: Path, monkeypatch: pytest.MonkeyP
     copies = [{"mesh": 0}] * 100
     path = broken(tmp_path, (("nodes",), copies), (("scenes", 0, "nodes"), list(range(100))))
     assert load_shape(path).V == 400
-    monkeypatch.setattr(formats, "FEW_PLACES", 300)
+    monkeypatch.setattr(formats, "BASE_ELEMENTS", 300)
     with pytest.raises(InputError, match=r"makes [0-9,]+ vertices and faces"):
         load_shape(path)
     monkeypatch.undo()
@@ -195,8 +195,8 @@ def test_ply_of_more_than_its_bytes_can_mean(tmp_path: Path, monkeypatch: pytest
     content = "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header", ""]).encode() + body
     (tmp_path / "a.ply").write_bytes(content)
     load_shape(tmp_path / "a.ply")
-    monkeypatch.setattr(formats, "FEW_PLACES", 100)
-    monkeypatch.setattr(ply_rows, "FEW_PLACES", 100)
+    monkeypatch.setattr(formats, "BASE_ELEMENTS", 100)
+    monkeypatch.setattr(ply_rows, "BASE_ELEMENTS", 100)
     refused(tmp_path / "a.ply", content, r"makes [0-9,]+ vertices and faces|has lists of [0-9,]+ numbers")
 
 
@@ -215,7 +215,7 @@ def test_more_than_the_bytes_of_a_file_can_mean(tmp_path: Path, monkeypatch: pyt
     else:
         path.write_text(content)
     assert load_shape(path).V > 2
-    monkeypatch.setattr(formats, "FEW_PLACES", 100)
+    monkeypatch.setattr(formats, "BASE_ELEMENTS", 100)
     refused(path, path.read_bytes(), "vertices and faces")
 
 

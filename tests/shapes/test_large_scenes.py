@@ -14,7 +14,7 @@ from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_dressed import dressed
 from meshmatch.shapes.formats.gltf_edit import Editor
-from meshmatch.shapes.formats.gltf_former import hang_over
+from meshmatch.shapes.formats.gltf_former import reattach_children
 from meshmatch.shapes.formats.gltf_humanoid import person_of
 from meshmatch.shapes.formats.gltf_morphs import read_morphs, with_morphs
 from meshmatch.shapes.formats.gltf_prune import drop_nodes
@@ -120,7 +120,7 @@ def test_what_hangs_from_joints_that_move_nothing(tmp_path: Path) -> None:
         binding = Binding(rig, np.eye(4)[None], np.zeros((V, 1), np.int32), np.ones((V, 1), np.float32))
         editor = Editor(scene)
         editor.json["nodes"].append({})
-        return lambda: (hang_over(editor, scene, set(range(N + 1)), binding, [len(nodes)]), editor)
+        return lambda: (reattach_children(editor, scene, set(range(N + 1)), binding, [len(nodes)]), editor)
 
     hung, editor = grows_with_size(prepared, 3_200)
     assert hung == set(range(3_202, 6_403)) and set(editor.json["nodes"][-1]["children"]) == hung

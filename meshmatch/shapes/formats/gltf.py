@@ -166,7 +166,9 @@ class Document:
             verts.append(positions)
             colors.append(self.colors(primitive))
             meshes.append((self._names(node), len(positions)))
-            skinned.append(np.full(len(positions), "skin" in self.nodes[node] and "JOINTS_0" in primitive["attributes"]))
+            skinned.append(
+                np.full(len(positions), "skin" in self.nodes[node] and "JOINTS_0" in primitive["attributes"])
+            )
             n_verts += len(positions)
         self._warn_of_hidden()
         if not verts:

@@ -118,7 +118,9 @@ class Look:
             material_of_face.append(np.full(len(faces), numbers.setdefault(key, len(numbers))))
             uvs.append(np.zeros((len(faces), 3, 2)) if uv is None else uv[faces])
         vertex_colors = joined_colors(colors, counts)
-        found = Appearance(tuple(self.materials.values()), np.concatenate(material_of_face), np.concatenate(uvs), vertex_colors)
+        found = Appearance(
+            tuple(self.materials.values()), np.concatenate(material_of_face), np.concatenate(uvs), vertex_colors
+        )
         if self.picture is not None and not found.textured:
             raise no_coordinates(self.document.name)
         return found
@@ -156,7 +158,9 @@ class Look:
             uri = entry.get("uri")
             data = self.document.view_bytes(entry["bufferView"]) if uri is None else self.document.resource(uri)
             embedded_image = uri is None or embedded(uri)
-            self.images[number] = self.reader.decode(data, f"image {number} of {self.document.name}" if embedded_image else uri)
+            self.images[number] = self.reader.decode(
+                data, f"image {number} of {self.document.name}" if embedded_image else uri
+            )
         return self.images[number]
 
     def _coordinates(self, primitive: dict[str, Any]) -> Floats | None:
@@ -206,7 +210,9 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
                 row, column = np.nonzero(np.isfinite(weight) & (weight > 0))
                 used = numbers[row, column]
                 if not ((used >= 0) & (used < len(skin_columns))).all():
-                    raise ValueError(f"a vertex refers to a joint that is not among the {len(skin_columns)} of its skin")
+                    raise ValueError(
+                        f"a vertex refers to a joint that is not among the {len(skin_columns)} of its skin"
+                    )
                 entries.append((n_verts + row, skin_columns[used.astype(np.int64)], weight[row, column]))
         elif (joint := nearest_joint[number]) is not None:
             entries.append((n_verts + np.arange(V), np.full(V, column_of[joint]), np.ones(V)))

@@ -1,7 +1,7 @@
-"""Editing a glTF file: what is in it stays as it is, something is added, and it becomes one glb.
+"""Edit a glTF file: keep its content, add to it, and write it as one glb.
 
-The bytes of its binary chunk keep their places; buffers and images in other files are put behind them, so that the glb
-needs no other file.
+The bytes of its binary chunk keep their offsets; buffers and images in other files are appended, so that the glb is
+self-contained.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ _IMAGES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "ima
 
 
 class Editor:
-    """A copy of a document that can grow. ``json`` may be changed at will; arrays are added with `add_array`."""
+    """An editable copy of a document. ``json`` may be changed freely; `add_array` adds arrays."""
 
     def __init__(self, document: Document) -> None:
         self.name, self.json = document.name, copy.deepcopy(document.json)
         self._chunks: list[bytes] = []
         self._size = 0
         self._uses = Counter(node["mesh"] for node in document.nodes if "mesh" in node)
-        files: dict[str | int, int] = {}  # a thousand buffers, or images, may name one file
+        files: dict[str | int, int] = {}  # a thousand buffers, or images, may refer to one file
         starts = []
         for k, buffer in enumerate(self.json.get("buffers", [])):
             uri = buffer.get("uri", "")
-            own = k if not uri or embedded(uri) else uri
-            if own not in files:
-                files[own] = self._append(document.buffer(k))
-            starts.append(files[own])
+            source = k if not uri or embedded(uri) else uri
+            if source not in files:
+                files[source] = self._append(document.buffer(k))
+            starts.append(files[source])
         for view in self.json.get("bufferViews", []):
             start = starts[view["buffer"]]
             view["buffer"] = 0
@@ -55,14 +55,14 @@ class Editor:
             if uri is not None and not embedded(uri):
                 if uri not in views:
                     data = document.resource(uri)
-                    kind = next((kind for magic, kind in _IMAGES.items() if data.startswith(magic)), "image/png")
-                    views[uri] = self.add_view(data), kind
+                    mime = next((mime for magic, mime in _IMAGES.items() if data.startswith(magic)), "image/png")
+                    views[uri] = self.add_view(data), mime
                 del image["uri"]
-                image["bufferView"], kind = views[uri]
-                image.setdefault("mimeType", kind)
+                image["bufferView"], mime = views[uri]
+                image.setdefault("mimeType", mime)
 
     def _append(self, data: bytes) -> int:
-        """Where the data begins, a multiple of four."""
+        """Append data, padded to four bytes; return its start offset, a multiple of four."""
         start = self._size
         padded = data + b"\0" * (-len(data) % 4)
         self._chunks.append(padded)
@@ -70,53 +70,53 @@ class Editor:
         return start
 
     def add_buffer(self, other: Editor) -> None:
-        """Put the data of another document behind this one's, and let its buffer views point there."""
+        """Append the data of another editor, and shift the offsets of the other's buffer views accordingly."""
         start = self._append(b"".join(other._chunks))
         for view in other.json.get("bufferViews", []):
             view["byteOffset"] = view.get("byteOffset", 0) + start
 
     def draw(self, document: Document, node: int) -> None:
-        """Let a new node hang from nothing in the scene."""
+        """Make a node a root of the scene."""
         self._scene(document).setdefault("nodes", []).append(node)
 
     def _scene(self, document: Document) -> dict[str, Any]:
-        """The scene that is drawn; a document need not have one."""
+        """Return the default scene; create one if the document has none."""
         if not self.json.get("scenes"):
             self.json |= {"scenes": [{"nodes": document.roots()}], "scene": 0}
-        found: dict[str, Any] = self.json["scenes"][self.json.get("scene", 0)]
-        return found
+        scene: dict[str, Any] = self.json["scenes"][self.json.get("scene", 0)]
+        return scene
 
     def add_view(self, data: bytes, target: int | None = None) -> int:
-        """The number of a new buffer view."""
+        """Add a buffer view with this data; return its number."""
         view = {"buffer": 0, "byteOffset": self._append(data), "byteLength": len(data)}
         return self.add("bufferViews", view if target is None else view | {"target": target})
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """The number of a new node, mesh, skin or whatever else the document lists."""
+        """Append an entry to a top-level list of the document ("nodes", "meshes", "skins", ...); return its number."""
         self.json.setdefault(kind, []).append(entry)
         return len(self.json[kind]) - 1
 
     def add_array(self, values: NDArray[Any], *, bounds: bool = False, target: int | None = None) -> int:
-        """The number of a new accessor for values (N,) or (N, width): float32, or integers of up to 32 bits.
+        """Add an accessor for values (N,) or (N, width), float32 or integers of up to 32 bits; return its number.
 
-        With ``bounds`` it says between which values they lie, as positions and times must.
+        With ``bounds`` it has their minimum and maximum, which glTF requires for positions and times.
         """
         table = np.ascontiguousarray(values).reshape(len(values), -1)
-        kind = _COMPONENTS[table.dtype.str[1:]]
+        component_type = _COMPONENTS[table.dtype.str[1:]]
         entry: dict[str, Any] = {
             "bufferView": self.add_view(table.astype(table.dtype.newbyteorder("<")).tobytes(), target)
         }
-        entry |= {"componentType": kind, "count": len(table), "type": TYPES[table.shape[1]]}
+        entry |= {"componentType": component_type, "count": len(table), "type": TYPES[table.shape[1]]}
         if bounds:
             entry |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
         return self.add("accessors", entry)
 
     def add_rows(self, document: Document, number: int, rows: Int[Ints, " N"]) -> int:
-        """The number of a new accessor of vertices: some rows of one of the document, as they are stored there."""
+        """Add an accessor with the given rows of a vertex accessor of the document, in its data type; return its number."""
         old = document.json["accessors"][number]
         values = document.accessor(number, whole=True)[rows].astype(COMPONENTS[old["componentType"]])
         size = values.shape[1] * values.itemsize
-        stride = size + -size % 4  # as vertices must be
+        stride = size + -size % 4  # vertex attributes must be aligned to four bytes
         table = np.zeros((len(values), stride), np.uint8)
         table[:, :size] = np.ascontiguousarray(values).view(np.uint8)
         view = self.add_view(table.tobytes(), VERTICES)
@@ -126,20 +126,20 @@ class Editor:
         return self.add("accessors", kept | {"bufferView": view, "count": len(values)})
 
     def add_indices(self, faces: Int[Ints, "F 3"], V: int) -> int:
-        """The number of a new accessor for triangles among V vertices."""
+        """Add an accessor for triangles among V vertices; return its number."""
         return self.add_array(faces.astype("<u2" if V < 65_535 else "<u4").reshape(-1), target=INDICES)
 
     def turn(self, document: Document, rotation: Float[Floats, "3 3"]) -> None:
-        """Turn the scene, by a node above all others."""
+        """Rotate the scene by a new root node above all others."""
         scene = self._scene(document)
         node = self.add_node("upright", Rotation.from_matrix(rotation).as_quat(), np.zeros(3))
         self.json["nodes"][node]["children"], scene["nodes"] = scene["nodes"], [node]
 
     def add_sparse(self, values: Float[NDArray[np.float32], "V D"], *, bounds: bool = False) -> int:
-        """The same for values that are mostly zeros: only the others are stored, where that takes less space."""
+        """Like `add_array`, for rows that are mostly zero: only nonzero rows are stored where that takes less space."""
         rows = np.flatnonzero(values.any(axis=1))
         numbers = rows.astype("<u2" if len(values) <= 2**16 else "<u4")
-        if numbers.nbytes + values[rows].nbytes + 64 > values.nbytes:  # there are two views to describe
+        if numbers.nbytes + values[rows].nbytes + 64 > values.nbytes:  # 64 bytes for two more views
             return self.add_array(values, bounds=bounds, target=VERTICES)
         entry: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": TYPES[values.shape[1]]}
         if len(rows):
@@ -154,7 +154,7 @@ class Editor:
         return self.add("accessors", entry)
 
     def own_mesh(self, number: int) -> dict[str, Any]:
-        """The mesh of a node, which other nodes draw no more: it can be changed."""
+        """Return the mesh of a node for editing; it is copied first if other nodes draw it as well."""
         node = self.json["nodes"][number]
         if self._uses[node["mesh"]] > 1:
             self._uses[node["mesh"]] -= 1
@@ -162,11 +162,11 @@ class Editor:
             node["mesh"] = self.add("meshes", copy.deepcopy(self.json["meshes"][old]))
             gltf_vrm.copy_mesh(self.json, old, node["mesh"])
             self._uses[node["mesh"]] = 1
-        found: dict[str, Any] = self.json["meshes"][node["mesh"]]
-        return found
+        mesh: dict[str, Any] = self.json["meshes"][node["mesh"]]
+        return mesh
 
     def add_node(self, name: str, rotation: Float[Floats, " 4"], translation: Float[Floats, " 3"]) -> int:
-        """The number of a new node, which hangs from nothing yet; the rotation is x, y, z, w."""
+        """Add a node without a parent; return its number. The rotation is a quaternion x, y, z, w."""
         entry: dict[str, Any] = {"name": name} if name else {}
         if np.any(translation):
             entry["translation"] = translation.tolist()
@@ -175,59 +175,64 @@ class Editor:
         return self.add("nodes", entry)
 
     def prune(self, document: Document) -> None:
-        """Take out what was used in the document, and is not any more."""
+        """Remove everything that was used in the document but is unused now, and its data."""
         if not prune(self.json, unused(document.json)):
             return
         views = self.json.get("bufferViews", [])
         spans = {(view.get("byteOffset", 0), view["byteLength"]) for view in views}
-        if sum(length for _, length in spans) > self._size:  # they lie over each other
+        if sum(length for _, length in spans) > self._size:  # views overlap
             return
         whole = b"".join(self._chunks)
         self._chunks, self._size = [], 0
         places: dict[tuple[int, int], int] = {}
         for start, length in sorted(spans):
-            shift = start % 4  # accessors are aligned within
+            shift = start % 4  # keeps the alignment of accessors
             places[start, length] = self._append(bytes(shift) + whole[start : start + length]) + shift
         for view in views:
             view["byteOffset"] = places[view.get("byteOffset", 0), view["byteLength"]]
 
     def to_bytes(self) -> bytes:
-        """The glb. `OutputError` where it would be larger than a glb can be."""
+        """Return the glb; `OutputError` if it exceeds the size limit of a glb."""
         if self._size:
             self.json["buffers"] = [{"byteLength": self._size}]
         return packed(self.name, self.json, self._chunks)
 
 
 def remembering(glb: bytes, of: Shape) -> bytes:
-    """A glb that says of what mesh it was made, if its first vertices are that mesh's, in their order, and what is behind
-    them are copies of them, or other meshes.
+    """Record in a glb the mesh it was made from; see `Shape.made_of`.
+
+    The glb is returned unchanged unless its first vertices are those of the mesh, in order, followed only by copies of
+    them or by other meshes; its faces are checked for this.
     """
     document = Document(Path("made.glb"), glb)
     faces = document.faces()
-    own = faces[: of.F]
-    if len(own) < of.F or not ((own == of.faces) | (own >= of.V)).all():
+    leading = faces[: of.F]
+    if len(leading) < of.F or not ((leading == of.faces) | (leading >= of.V)).all():
         return glb
     editor = Editor(document)
     asset = editor.json["asset"]
-    said = {"made_of": [of.hash, *of.made_of][:MAX_ORIGINS], "faces": digest(faces)}
-    asset["extras"] = (asset["extras"] if isinstance(asset.get("extras"), dict) else {}) | {ORIGINS: said}
+    record = {"made_of": [of.hash, *of.made_of][:MAX_ORIGINS], "faces": digest(faces)}
+    asset["extras"] = (asset["extras"] if isinstance(asset.get("extras"), dict) else {}) | {ORIGINS: record}
     return editor.to_bytes()
 
 
 def drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
-    """Nodes that draw something, in the order of the scene, with the numbers of the primitives that they draw."""
-    place = {id(part): k for mesh in document.json["meshes"] for k, part in enumerate(mesh["primitives"])}
+    """Nodes that draw something, in scene order; for each, the primitives that it draws, by their number in the mesh.
+
+    `InputError` if the scene uses GPU instancing.
+    """
+    number_of = {id(part): k for mesh in document.json["meshes"] for k, part in enumerate(mesh["primitives"])}
     found: dict[int, dict[int, dict[str, Any]]] = {}
     for number, part, _ in document.primitives():
         if INSTANCES in document.nodes[number].get("extensions", {}):
-            copies = f"{document.name} draws copies of one mesh ({INSTANCES}), which cannot move apart"
-            raise InputError(copies, "export each copy as an object of its own")
-        found.setdefault(number, {})[place[id(part)]] = part
+            message = f"{document.name} draws copies of one mesh ({INSTANCES}), which cannot move apart"
+            raise InputError(message, "export each copy as an object of its own")
+        found.setdefault(number, {})[number_of[id(part)]] = part
     return found
 
 
 def frames_of(document: Document, number: int, part: dict[str, Any]) -> Float[Floats, "V 3 3"]:
-    """What takes directions at each vertex of a primitive into the scene: its skin, or else its node."""
+    """Linear maps, at each vertex of a primitive, that take directions to scene coordinates: by its skin or its node."""
     V, place = document.count(part["attributes"]["POSITION"]), document.world[number]
     axes = [document.moved(number, part, np.tile(axis, (V, 1)), place) for axis in np.eye(4)[:3]]
     return np.stack(axes, axis=2)

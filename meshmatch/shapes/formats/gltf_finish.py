@@ -1,4 +1,4 @@
-"""What the materials of a glTF scene say besides their colors: metal, roughness, normals, occlusion and light.
+"""Read the layers of glTF materials besides base color: metalness, roughness, normals, occlusion and emission.
 
 Specification: Khronos glTF 2.0, section 3.9; KHR_materials_emissive_strength, KHR_materials_unlit,
 KHR_materials_pbrSpecularGlossiness (its glossiness). Faces are those of `meshmatch.shapes.formats.gltf.read`.
@@ -19,20 +19,21 @@ from meshmatch.shapes.formats.gltf_attributes import Look
 from meshmatch.shapes.shape import Shape
 
 _UNLIT, _STRENGTH = "KHR_materials_unlit", "KHR_materials_emissive_strength"
-_WORDS: dict[Layer, str] = {
+_LABELS: dict[Layer, str] = {
     "normal": "normal map",
     "surface": "metal and roughness",
     "occlusion": "occlusion map",
     "glow": "emission",
 }
-# Of a material, what changes how it looks and is not one of the layers.
-_OTHERS = "KHR_materials_"
+# Prefix of material extensions; those that are not in `_READ` are reported as not transferred.
+_MATERIAL_PREFIX = "KHR_materials_"
 _READ = (_UNLIT, _STRENGTH, "KHR_materials_pbrSpecularGlossiness", "KHR_materials_variants")
 
 
 def read_finish(path: Path, data: bytes, _: Shape, reader: ImageReader) -> Finish | None:
-    """The layers of a scene's materials; None where it has no material. An image that cannot be read is told, and its layer
-    left out.
+    """Read the layers of a scene's materials; None if it has no material.
+
+    A layer whose image cannot be read is left out, with a warning.
     """
     return understood(path, data, "materials make", lambda document: _finish(document, reader))
 
@@ -42,32 +43,34 @@ def _finish(document: Document, reader: ImageReader) -> Finish | None:
     entries = [document.json["materials"][number] for number in sorted(used)]
     if not entries:
         return None
-    light = max((_light(entry) for entry in entries), default=1.0)
+    light = max((_peak_emission(entry) for entry in entries), default=1.0)
     images: dict[int, Pixels] = {}
     layers: dict[Layer, Appearance] = {}
     for layer in get_args(Layer):
         try:
             found = _LayerLook(document, reader, images, layer, max(light, 1.0)).scene()
         except InputError as error:
-            warn(f"the {_WORDS[layer]} of {document.name} cannot be read and is left out: {error.message}")
+            warn(f"the {_LABELS[layer]} of {document.name} cannot be read and is left out: {error.message}")
         else:
             layers[layer] = replace(found, colors=None)
-    others = {name for entry in entries for name in entry.get("extensions", {}) if name.startswith(_OTHERS)}
-    if others := others - {*_READ}:
-        named = ", ".join(sorted(name.removeprefix(_OTHERS) for name in others))
+    unsupported = {
+        name for entry in entries for name in entry.get("extensions", {}) if name.startswith(_MATERIAL_PREFIX)
+    }
+    if unsupported := unsupported - {*_READ}:
+        named = ", ".join(sorted(name.removeprefix(_MATERIAL_PREFIX) for name in unsupported))
         warn(f"the materials of {document.name} have what is not transferred: {named[:200]}")
     unlit = all(_UNLIT in entry.get("extensions", {}) for entry in entries)
     return Finish(layers, max(light, 1.0), any(entry.get("doubleSided", False) for entry in entries), unlit)
 
 
-def _light(entry: dict[str, Any]) -> float:
-    """The largest part of the light that a material sends out."""
+def _peak_emission(entry: dict[str, Any]) -> float:
+    """Emission of the strongest channel of a material: emissive factor times emissive strength."""
     strength = float(entry.get("extensions", {}).get(_STRENGTH, {}).get("emissiveStrength", 1.0))
     return strength * max(float(value) for value in entry.get("emissiveFactor", (0.0, 0.0, 0.0)))
 
 
 class _LayerLook(Look):
-    """Reads one layer of a scene's materials."""
+    """Reader of one layer of a scene's materials; emission is divided by `light`."""
 
     def __init__(
         self, document: Document, reader: ImageReader, images: dict[int, Pixels], layer: Layer, light: float
@@ -76,7 +79,7 @@ class _LayerLook(Look):
         self.images, self.layer, self.light = images, layer, light
 
     def base(self, number: int) -> tuple[dict[str, Any], dict[str, Any] | None, tuple[float, ...]]:
-        """A material, the texture of the layer and its factor."""
+        """Return a material, the texture of the layer and its factor."""
         entry = self.json["materials"][number] if number >= 0 else {}
         if self.layer == "normal":
             texture = entry.get("normalTexture")
@@ -84,23 +87,23 @@ class _LayerLook(Look):
         if self.layer == "occlusion":
             return entry, entry.get("occlusionTexture"), (1.0,) * 4
         if self.layer == "glow":
-            extra = float(entry.get("extensions", {}).get(_STRENGTH, {}).get("emissiveStrength", 1.0)) / self.light
-            color = [extra * float(value) for value in entry.get("emissiveFactor", (0.0, 0.0, 0.0))]
+            strength = float(entry.get("extensions", {}).get(_STRENGTH, {}).get("emissiveStrength", 1.0)) / self.light
+            color = [strength * float(value) for value in entry.get("emissiveFactor", (0.0, 0.0, 0.0))]
             return entry, entry.get("emissiveTexture"), (*color, 1.0)
         gloss = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
         if gloss is not None and "pbrMetallicRoughness" not in entry:
             return entry, None, (1.0, 1.0 - float(gloss.get("glossinessFactor", 1.0)), 0.0, 1.0)
-        paint = entry.get("pbrMetallicRoughness", {})
+        pbr = entry.get("pbrMetallicRoughness", {})
         default = 1.0 if number >= 0 else 0.0
-        factors = paint.get("roughnessFactor", 1.0), paint.get("metallicFactor", default)
-        return entry, paint.get("metallicRoughnessTexture"), (1.0, *map(float, factors), 1.0)
+        factors = pbr.get("roughnessFactor", 1.0), pbr.get("metallicFactor", default)
+        return entry, pbr.get("metallicRoughnessTexture"), (1.0, *map(float, factors), 1.0)
 
-    def read(self, number: int, laid: bool) -> Material:
-        """A material of the layer, with its image if there are coordinates."""
+    def read(self, number: int, has_uv: bool) -> Material:
+        """Read a material of the layer, with its image if the primitive has texture coordinates (`has_uv`)."""
         _, texture, _ = self.base(number)
-        made = super().read(number, laid)
-        if self.layer == "normal" and made.image is None:  # also where there are no coordinates
-            made = replace(made, factor=(0.5, 0.5, 1.0, 1.0))
+        material = super().read(number, has_uv)
+        if self.layer == "normal" and material.image is None:  # also if there are no texture coordinates
+            material = replace(material, factor=(0.5, 0.5, 1.0, 1.0))
         key = {"normal": "scale", "occlusion": "strength"}.get(self.layer, "")
         strength = float(np.clip(float((texture or {}).get(key, 1.0)), 0.0, 1e3))
-        return replace(made, alpha="opaque", linear=self.layer != "glow", strength=strength)
+        return replace(material, alpha="opaque", linear=self.layer != "glow", strength=strength)

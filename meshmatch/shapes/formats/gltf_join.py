@@ -1,4 +1,4 @@
-"""One glTF scene put into another: what is drawn in it is added, with its materials and images.
+"""Add everything that one glTF scene draws to another scene, with its materials and images.
 
 Specification: Khronos glTF 2.0, sections 3.5 and 3.7.3.
 """
@@ -18,50 +18,50 @@ from meshmatch.shapes.formats.gltf_edit import Editor, drawn
 from meshmatch.shapes.formats.gltf_out import VERTICES
 from meshmatch.shapes.formats.gltf_prune import references
 from meshmatch.shapes.formats.gltf_rig import Binding
-from meshmatch.shapes.formats.gltf_rigged import frame_of, straighten
+from meshmatch.shapes.formats.gltf_rigged import bake_transform, frame_of
 
 _KINDS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes")
 _VARIANTS = "KHR_materials_variants"
 
 
 def joined(document: Document, added: Document, binding: Binding | None) -> bytes:
-    """A scene as a glb with all that another one draws, each mesh on a node of its own, as it stands there.
+    """Return a scene as a glb, with the meshes of another scene added, one new node each, at their world positions.
 
     Parameters
     ----------
     document
-        The scene; what is in it stays as it is.
+        The scene; its content is kept.
     added
-        What is put into it. Its clips, cameras and lights stay out.
+        The scene to add, without its clips, cameras and lights.
     binding
-        How the joints of the scene, in the order of `joint_nodes`, move the vertices that are added; a scene without joints
-        moves none.
+        Skin weights of the added vertices for the joints of `document`, in the order of `joint_nodes`. None, or a scene
+        without joints: the added meshes are not skinned.
     """
     editor, joints = Editor(document), joint_nodes(document)
     parts = drawn(added)
-    meshes, frames = _taken_over(editor, added, parts)
-    where, shares = (None, None) if binding is None or not joints else binding.table()
-    seen = 0
+    meshes, frames = _copy_meshes(editor, added, parts)
+    joint_rows, weight_rows = (None, None) if binding is None or not joints else binding.table()
+    n_verts = 0
     for (number, own), mesh, frame in zip(parts.items(), meshes, frames, strict=True):
-        held = editor.json["meshes"][mesh]
+        mesh_entry = editor.json["meshes"][mesh]
         entry: dict[str, Any] = {"mesh": mesh}
-        if name := added.nodes[number].get("name") or held.get("name"):
+        if name := added.nodes[number].get("name") or mesh_entry.get("name"):
             entry["name"] = name
         entry |= {key: added.nodes[number][key] for key in ("weights", "extras") if key in added.nodes[number]}
         for k, part in own.items():
-            some = slice(seen, seen + added.count(part["attributes"]["POSITION"]))
-            seen = some.stop
-            attributes = held["primitives"][k]["attributes"]
+            rows = slice(n_verts, n_verts + added.count(part["attributes"]["POSITION"]))
+            n_verts = rows.stop
+            attributes = mesh_entry["primitives"][k]["attributes"]
             for key in [key for key in attributes if key.startswith(("JOINTS_", "WEIGHTS_"))]:
                 del attributes[key]
-            if where is not None and shares is not None:
-                attributes["JOINTS_0"] = editor.add_array(where[some], target=VERTICES)
-                attributes["WEIGHTS_0"] = editor.add_array(shares[some], target=VERTICES)
+            if joint_rows is not None and weight_rows is not None:
+                attributes["JOINTS_0"] = editor.add_array(joint_rows[rows], target=VERTICES)
+                attributes["WEIGHTS_0"] = editor.add_array(weight_rows[rows], target=VERTICES)
         if binding is None or not joints:
             entry["matrix"] = frame.T.ravel().tolist()
         else:
-            back = np.linalg.inv(binding.bind[binding.rig.joints]) @ frame
-            inverse = editor.add_array(back.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))
+            inverse_bind = np.linalg.inv(binding.bind[binding.rig.joints]) @ frame
+            inverse = editor.add_array(inverse_bind.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))
             entry["skin"] = editor.add("skins", {"joints": joints, "inverseBindMatrices": inverse})
         node = editor.add("nodes", entry)
         editor.draw(document, node)
@@ -69,11 +69,12 @@ def joined(document: Document, added: Document, binding: Binding | None) -> byte
     return editor.to_bytes()
 
 
-def _taken_over(
+def _copy_meshes(
     editor: Editor, added: Document, parts: dict[int, dict[int, dict[str, Any]]]
 ) -> tuple[list[int], list[Floats]]:
-    """Put the meshes of nodes, with all that they refer to, into another document; returns their numbers there, and what
-    puts their vertices where they stand.
+    """Copy the meshes of nodes, with everything they refer to, into another document.
+
+    Returns their numbers there, and for each the matrix that takes its vertices to scene coordinates.
     """
     other = Editor(added)
     offset = {kind: len(editor.json.get(kind, [])) for kind in _KINDS}
@@ -82,7 +83,7 @@ def _taken_over(
     for (number, own), mesh in zip(parts.items(), meshes, strict=True):
         frame = frame_of(added, number, own)
         for k, part in own.items() if frame is None else ():
-            straighten(other, added, number, part, mesh["primitives"][k])
+            bake_transform(other, added, number, part, mesh["primitives"][k])
         frames.append(np.eye(4) if frame is None else frame)
     other.json |= {"meshes": meshes, "skins": [], "animations": []}
     for kind, holder, key in references(other.json):
@@ -98,7 +99,7 @@ def _taken_over(
     gltf_vrm.complete_properties(other.json)
     gltf_vrm.complete_properties(editor.json, gltf_vrm.properties(other.json))
     for key in ("extensionsUsed", "extensionsRequired"):
-        theirs = [name for name in other.json.get(key, []) if name not in gltf_vrm.ROOTS]
-        if listed := [*editor.json.get(key, []), *theirs]:
+        added_names = [name for name in other.json.get(key, []) if name not in gltf_vrm.ROOTS]
+        if listed := [*editor.json.get(key, []), *added_names]:
             editor.json[key] = list(dict.fromkeys(listed))
     return [offset["meshes"] + k for k in range(len(meshes))], frames

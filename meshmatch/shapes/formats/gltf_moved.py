@@ -1,7 +1,7 @@
-"""A glTF scene whose vertices have moved: nodes, meshes, skins, materials and images stay as they are.
+"""Write a glTF scene with new vertex positions: nodes, meshes, skins, materials and images are kept.
 
-What belongs to vertices turns with them: normals, tangents and morph targets, which also grow. All is stored as the node or
-the skin puts it into place, so that the scene stands as it was asked to; joints stay where they are.
+Normals, tangents and morph targets rotate with their vertices; morph targets are also scaled by the local stretch. All are
+stored in the local coordinates that the node or the skin, with joints unmoved, maps to the requested positions.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from meshmatch.shapes.formats.gltf_out import VERTICES
 
 
 def moved(document: Document, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:
-    """The scene as a glb whose vertices are elsewhere.
+    """Return the scene as a glb with new vertex positions.
 
     Parameters
     ----------
     document
         The scene.
     verts
-        Where its vertices are now, in the order of `gltf.read`; a row that is not finite stays.
+        New positions, in the order of `gltf.read`; vertices with a row that is not finite are not moved.
     turns
-        The rotation around each of them.
+        Rotation at each vertex.
     """
     editor = Editor(document)
-    seen = 0
+    first = 0
     for number, parts in drawn(document).items():
         mesh = editor.own_mesh(number)
         for k, part in parts.items():
-            some = slice(seen, seen + document.count(part["attributes"]["POSITION"]))
-            seen = some.stop
-            _move(editor, document, number, part, mesh["primitives"][k], verts[some], turns[some])
+            rows = slice(first, first + document.count(part["attributes"]["POSITION"]))
+            first = rows.stop
+            _move(editor, document, number, part, mesh["primitives"][k], verts[rows], turns[rows])
     editor.prune(document)
     return editor.to_bytes()
 
@@ -54,34 +54,38 @@ def _move(
     place = document.world[number]
     before, frames = document.placed(number, part, place), frames_of(document, number, part)
     origin = document.moved(number, part, np.tile([0.0, 0.0, 0.0, 1.0], (len(verts), 1)), place)
-    back = np.linalg.pinv(frames)
-    kept = np.asarray(~np.isfinite(verts).all(axis=1))
-    now = np.where(kept[:, None], before, verts)
-    turned = back @ np.where(kept[:, None, None], np.eye(3), turns) @ frames
-    facing = np.linalg.pinv(turned).swapaxes(1, 2)  # normals turn so that they stay across tangents
+    to_local = np.linalg.pinv(frames)
+    unmoved = np.asarray(~np.isfinite(verts).all(axis=1))
+    now = np.where(unmoved[:, None], before, verts)
+    local_turns = to_local @ np.where(unmoved[:, None, None], np.eye(3), turns) @ frames
+    normal_maps = np.linalg.pinv(local_turns).swapaxes(1, 2)  # normals transform by the inverse transpose
 
     def rows(accessor: int, by: NDArray[Any]) -> Floats:
         values = document.accessor(accessor)
         return np.hstack([np.einsum("vij,vj->vi", by, values[:, :3]), values[:, 3:]])
 
     attributes = own["attributes"]
-    local = np.einsum("vij,vj->vi", back, now - origin)
+    local = np.einsum("vij,vj->vi", to_local, now - origin)
     attributes["POSITION"] = editor.add_array(local.astype("<f4"), bounds=True, target=VERTICES)
-    for key, by in (("NORMAL", facing), ("TANGENT", turned)):
+    for key, by in (("NORMAL", normal_maps), ("TANGENT", local_turns)):
         if key in attributes:
             values = rows(attributes[key], by)
             values[:, :3] = unit(values[:, :3])
             attributes[key] = editor.add_array(values.astype("<f4"), target=VERTICES)
-    growth = _growth(before, now, document.triangles(part)) if "targets" in own else np.ones(len(now))
+    stretch = _stretch(before, now, document.triangles(part)) if "targets" in own else np.ones(len(now))
     for target in own.get("targets", []):
-        for key, by in (("POSITION", growth[:, None, None] * turned), ("NORMAL", facing), ("TANGENT", turned)):
+        for key, by in (
+            ("POSITION", stretch[:, None, None] * local_turns),
+            ("NORMAL", normal_maps),
+            ("TANGENT", local_turns),
+        ):
             if key in target:
                 target[key] = editor.add_sparse(rows(target[key], by).astype(np.float32), bounds=key == "POSITION")
 
 
-def _growth(before: Float[Floats, "N 3"], now: Float[Floats, "N 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, " N"]:
-    """How much longer the edges at each vertex have become."""
+def _stretch(before: Float[Floats, "N 3"], now: Float[Floats, "N 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, " N"]:
+    """Ratio of new to old total length of the edges at each vertex; the overall ratio for vertices without edges."""
     edges = edges_of(faces).vertices
     sums = [np.bincount(edges.T.ravel(), np.tile(edge_lengths(each, edges), 2), len(now)) for each in (before, now)]
-    usual = float(sums[1].sum() / sums[0].sum()) if sums[0].sum() > 0 else 1.0
-    return np.asarray(np.where(sums[0] > 0, sums[1] / np.where(sums[0] > 0, sums[0], 1.0), usual), np.float64)
+    overall = float(sums[1].sum() / sums[0].sum()) if sums[0].sum() > 0 else 1.0
+    return np.asarray(np.where(sums[0] > 0, sums[1] / np.where(sums[0] > 0, sums[0], 1.0), overall), np.float64)

@@ -1,8 +1,8 @@
-"""Writing glTF 2.0, binary (glb): one node, one mesh, one primitive, and its morph targets; a texture is laid on by
-`meshmatch.shapes.formats.gltf_dressed`.
+"""Write glTF 2.0, binary (glb): one node, one mesh, one primitive, and its morph targets.
 
-Positions are 32-bit floats, with about seven digits. Those of a shape that lies far from the origin, as a scan in
-coordinates of a country does, are written from a center near it; the center is the node's translation, in all its digits.
+`meshmatch.shapes.formats.gltf_dressed` adds textures. Positions are 32-bit floats, with about seven digits. Those of a
+shape far from the origin, such as a scan in national grid coordinates, are written relative to a center near it; the center
+is the node's translation, in full precision.
 
 Specification: Khronos glTF 2.0.
 """
@@ -24,26 +24,29 @@ from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats import as_float32
 from meshmatch.shapes.shape import Shape
 
-# Coincident vertices whose normals are further than this cosine (32 degrees) from their mean are an edge of the shape,
-# not a seam; a cube stays one. Set by hand.
-_SHARP = 0.85
-_FAR = 8.0  # three of the 24 bits of a float
+# Coincident vertices whose normals differ from their mean by more than this cosine (32 degrees) lie on a sharp edge, not
+# on a seam, so that a cube keeps its edges. Set by hand.
+_MIN_SEAM_COSINE = 0.85
+_FAR = 8.0  # a distance of this many sizes costs three of the 24 bits of a float
 _POINTS, _TRIANGLES = 0, 4
 _FLOAT, _UNSIGNED = 5126, 5125
-_LARGEST = 2**32 - 1
+_MAX_BYTES = 2**32 - 1
 TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-"""Of accessors, by the numbers in a row."""
+"""Types of accessors, by the number of components."""
 VERTICES, INDICES = 34962, 34963
-"""The targets of buffer views that hold attributes of vertices, and triangles."""
+"""Targets of buffer views that contain vertex attributes, and vertex indices."""
 
 
 def write(path: Path, shape: Shape) -> None:
-    """A mesh or a cloud, see `glb_of`."""
+    """Write a mesh or a point cloud, see `glb_of`."""
     path.write_bytes(glb_of(shape))
 
 
 def glb_of(shape: Shape, turn: Float[Floats, "3 3"] | None = None) -> bytes:
-    """A mesh or a cloud; 32-bit floats, 32-bit indices, linear vertex colors. Its node makes the turn."""
+    """Return a mesh or a point cloud as a glb: 32-bit floats, 32-bit indices, linear vertex colors.
+
+    ``turn`` is the rotation of its node.
+    """
     attributes = {"POSITION": shape.verts}
     if not shape.is_cloud:
         attributes["NORMAL"] = smooth_normals(shape.verts, shape.faces)
@@ -55,9 +58,10 @@ def glb_of(shape: Shape, turn: Float[Floats, "3 3"] | None = None) -> bytes:
 def write_morphs(
     path: Path, shape: Shape, targets: Mapping[str, Float[Floats, "V 3"]], seconds: Float[Floats, " T"] | None = None
 ) -> None:
-    """A mesh with morph targets by name: where its vertices are when the target's weight is 1. All weights are 0.
+    """Write a mesh with morph targets, given by name as the vertex positions at weight 1; all weights are initially 0.
 
-    With ``seconds`` a clip shows the shape at the first of these, and then each target; at one more the shape again.
+    With ``seconds``, an animation shows the shape at the first of these times, then one target per time; a last time,
+    after those of all targets, shows the shape again.
     """
     normals = smooth_normals(shape.verts, shape.faces)
     moves = {
@@ -66,18 +70,18 @@ def write_morphs(
     }
     attributes = {"POSITION": shape.verts, "NORMAL": normals}
     keys = None
-    if seconds is not None:  # at each key one target, or none
+    if seconds is not None:  # each key shows one target, or none
         weights = np.eye(len(targets) + 1)[:, 1:]
         keys = seconds, np.concatenate([weights, weights[:1]])[: len(seconds)]
     path.write_bytes(_glb(Path(shape.name).stem, attributes, shape.faces, moves, keys=keys))
 
 
 def center_of(verts: Float[Floats, "V 3"]) -> Float[Floats, " 3"]:
-    """The point that positions should be measured from to keep their digits as 32-bit floats.
+    """Choose the origin for positions so that 32-bit floats keep their digits.
 
-    The origin, unless it is over `_FAR` times further from the middle of the shape than most of its vertices are; else a
-    point in the middle of them. The middle is the median, which a stray vertex does not move. Its coordinates are rounded
-    to a power of two near the size of the shape, so that positions that were 32-bit floats lose nothing.
+    This is (0, 0, 0), unless it is over `_FAR` times further from the median of the vertices than most vertices are; else
+    a point near the median, which is robust to stray vertices. Its coordinates are multiples of a power of two near the
+    size of the shape, so that positions that were 32-bit floats lose no bits.
     """
     middle = np.median(verts, axis=0)
     size = float(np.median(np.abs(verts - middle).max(axis=1)))
@@ -95,9 +99,10 @@ def _glb(
     turn: Float[Floats, "3 3"] | None = None,
     keys: tuple[Float[Floats, " T"], Float[Floats, "T M"]] | None = None,
 ) -> bytes:
-    """Arrays one after the other, each at a multiple of four bytes, behind what describes them.
+    """Build a glb: the JSON description, then all arrays, each aligned to four bytes.
 
-    ``keys`` are seconds, and the weights of all moves at each.
+    ``moves`` are morph targets by name: displacements of positions and normals. ``keys`` are the times of an animation in
+    seconds, and the weights of all targets at each.
     """
     center = center_of(attributes["POSITION"])
     attributes = attributes | {"POSITION": attributes["POSITION"] - center}
@@ -106,18 +111,18 @@ def _glb(
     if len(faces):
         primitive |= {"mode": _TRIANGLES, "indices": len(arrays)}
         arrays.append(faces.astype("<u4").reshape(-1, 1))
-    places = [0]  # positions need their box
+    bounded = [0]  # glTF requires the bounds of positions and times
     mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
     if moves:
         primitive["targets"] = []
         mesh |= {"weights": [0.0] * len(moves), "extras": {"targetNames": list(moves)}}
     for move in (moves or {}).values():
-        places.append(len(arrays))
+        bounded.append(len(arrays))
         primitive["targets"].append({key: len(arrays) + k for k, key in enumerate(move)})
         arrays += [as_float32(values, ".glb") for values in move.values()]
-    drawn = len(arrays)
+    n_vertex_arrays = len(arrays)
     if keys is not None:
-        places.append(drawn)
+        bounded.append(n_vertex_arrays)
         arrays += [as_float32(values.reshape(-1, 1), ".glb") for values in keys]
     chunks = [values.tobytes() for values in arrays]
     padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
@@ -128,12 +133,12 @@ def _glb(
     ]
     accessors: list[dict[str, Any]] = []
     for k, values in enumerate(arrays):
-        whole = values.dtype.kind == "u"
-        if k < drawn:
-            views[k]["target"] = INDICES if whole else VERTICES
-        kinds = {"componentType": _UNSIGNED if whole else _FLOAT, "type": TYPES[values.shape[1]]}
+        is_integer = values.dtype.kind == "u"
+        if k < n_vertex_arrays:
+            views[k]["target"] = INDICES if is_integer else VERTICES
+        kinds = {"componentType": _UNSIGNED if is_integer else _FLOAT, "type": TYPES[values.shape[1]]}
         accessors.append({"bufferView": k, **kinds, "count": len(values)})
-    for k in places:
+    for k in bounded:
         accessors[k] |= {"min": arrays[k].min(0).tolist(), "max": arrays[k].max(0).tolist()}
     document = {"asset": {"version": "2.0", "generator": "meshmatch"}, "scene": 0, "scenes": [{"nodes": [0]}]}
     node: dict[str, Any] = {"mesh": 0, "name": name}
@@ -146,34 +151,34 @@ def _glb(
     document |= {"nodes": [node], "meshes": [mesh]}
     if keys is not None:
         channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-        sampler = {"input": drawn, "output": drawn + 1, "interpolation": "LINEAR"}
+        sampler = {"input": n_vertex_arrays, "output": n_vertex_arrays + 1, "interpolation": "LINEAR"}
         document["animations"] = [{"name": name or "sequence", "channels": [channel], "samplers": [sampler]}]
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
     return packed(name, document, padded)
 
 
 def packed(name: str, document: dict[str, Any], chunks: Sequence[bytes]) -> bytes:
-    """The glb of what describes a file, and the bytes of its one buffer, in multiples of four.
+    """Assemble a glb from its JSON description and the chunks of its only buffer, each a multiple of four bytes long.
 
-    `OutputError` where it would be larger than a glb can be.
+    `OutputError` if it exceeds the size limit of a glb.
     """
     text = json.dumps(document, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    held = sum(map(len, chunks))
-    size = 28 + len(text) + held
-    if size > _LARGEST:
+    n_bytes = sum(map(len, chunks))
+    size = 28 + len(text) + n_bytes
+    if size > _MAX_BYTES:
         raise OutputError(f"{name} becomes larger than a glb can be (4 GiB)", "decimate it first")
     head = b"glTF" + np.array([2, size, len(text)], "<u4").tobytes() + b"JSON"
-    return b"".join([head, text, np.array([held], "<u4").tobytes(), b"BIN\0", *chunks])
+    return b"".join([head, text, np.array([n_bytes], "<u4").tobytes(), b"BIN\0", *chunks])
 
 
 def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Float[Floats, "V 3"]:
-    """Unit vertex normals; vertices at one place, as seams have them, share theirs unless they meet at an edge.
+    """Compute unit vertex normals; coincident vertices, as at seams, share a normal unless they lie on a sharp edge.
 
-    A vertex without a face gets the z axis: glTF wants unit length everywhere.
+    A vertex without a face gets the z axis, since glTF requires unit length everywhere.
     """
-    twin = same_rows(verts)
-    own, shared = vertex_normals(verts, faces), vertex_normals(verts, twin[faces])[twin]
-    normals = np.where((dot(own, shared) > _SHARP)[:, None], shared, own)
+    representative = same_rows(verts)
+    own, shared = vertex_normals(verts, faces), vertex_normals(verts, representative[faces])[representative]
+    normals = np.where((dot(own, shared) > _MIN_SEAM_COSINE)[:, None], shared, own)
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     return normals

@@ -1,4 +1,4 @@
-"""Skeletons of glTF scenes: joints, how they stand, the weights of the vertices that they move, and animation clips.
+"""Skeletons of glTF scenes: joints, their pose, skin weights and animation clips.
 
 Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 """
@@ -22,18 +22,18 @@ from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 Moved = Literal["rotation", "translation", "scale"]
 _WIDTHS: dict[str, int] = {"rotation": 4, "translation": 3, "scale": 3}
 _INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
-_FEW_KEYS = 3_500_000
-"""Keys of clips that a file of any size may have; and one more for every 4 of its bytes: several may share theirs."""
-MOST_JOINTS = 4096
-_MOST_NODES = 4  # for each of them, with those above and below
-_LARGEST = 1e18  # of a number: its square is still a 32-bit float
+_BASE_KEYS = 3_500_000
+"""Keys of clips allowed in a file of any size; each 4 bytes allow one more (channels may share their keys)."""
+MAX_JOINTS = 4096
+_MAX_NODES_PER_JOINT = 4  # including the nodes above and below the joints
+_MAX_VALUE = 1e18  # its square is still within the range of 32-bit floats
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Track(Brief):
-    """How one node moves in a clip.
+    """Animation of one property of one node in a clip.
 
-    Of a cubic spline there are three values for each time: the slope before it, the value and the slope after it.
+    A cubic spline has three values per time: in-tangent, value and out-tangent.
     """
 
     node: int
@@ -49,27 +49,27 @@ class Clip(Brief):
 
     name: str
     tracks: tuple[Track, ...]
-    extras: Any = None  # what somebody noted in the file
+    extras: Any = None  # application-specific data of the file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rig(Brief):
-    """A skeleton: joints, the nodes above them and the empty ones below; parents come before their children.
+    """A skeleton: joints, the nodes above them and empty nodes below them; parents come before their children.
 
-    Rotations, translations and scales are those of each node in the frame of its parent, as the nodes stand.
+    Rotations, translations and scales are those of each node relative to its parent, in the pose of the file.
     """
 
-    names: tuple[str, ...]  # N; may be empty, or occur twice
-    parents: Int[Ints, " N"]  # -1 for a node that hangs from nothing
+    names: tuple[str, ...]  # N; may be empty, and need not be unique
+    parents: Int[Ints, " N"]  # -1 for a root
     joints: Int[Ints, " J"]  # the node of each joint
     rotations: Float[Floats, "N 4"]  # x, y, z, w
     translations: Float[Floats, "N 3"]
     scales: Float[Floats, "N 3"]
     clips: tuple[Clip, ...]
-    extras: tuple[Any, ...] = ()  # N, or none: what somebody noted at the nodes
+    extras: tuple[Any, ...] = ()  # N, or empty: application-specific data of the nodes
 
     def worlds(self) -> Float[Floats, "N 4 4"]:
-        """Where every node stands in the scene."""
+        """World matrices of all nodes."""
         found = np.tile(np.eye(4), (len(self.parents), 1, 1))
         found[:, :3, :3] = Rotation.from_quat(self.rotations).as_matrix() * self.scales[:, None, :]
         found[:, :3, 3] = self.translations
@@ -81,20 +81,20 @@ class Rig(Brief):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Binding(Brief):
-    """A skeleton, and how it moves the vertices of a scene.
+    """A skeleton and its skin weights for the vertices of a scene.
 
     Attributes
     ----------
     rig
-        The skeleton as it is to stand, with its clips.
+        The skeleton in the pose that is to be written, with its clips.
     bind
-        Where its nodes stand when every vertex is where it was, but for the turn.
+        World matrices of its nodes in the bind pose, in which every vertex is at its position in the scene after the turn.
     joints
-        Numbers in ``rig.joints`` of up to four joints for each vertex.
+        Up to four joints per vertex, as indices into ``rig.joints``.
     weights
-        How much each of them moves the vertex.
+        Weight of each of these joints.
     turn
-        What turns the scene upright.
+        Rotation that makes the scene upright.
     """
 
     rig: Rig
@@ -104,19 +104,19 @@ class Binding(Brief):
     turn: Float[Floats, "3 3"] = field(default_factory=lambda: np.eye(3))
 
     def of(self, rows: Int[Ints, " N"]) -> Binding:
-        """That of other vertices, which move as some of these do."""
+        """Return the binding for other vertices: vertex k gets the joints and weights of vertex ``rows[k]`` here."""
         return replace(self, joints=self.joints[rows], weights=self.weights[rows])
 
     def table(self) -> tuple[NDArray[Any], Floats32]:
-        """Joints and weights, four for each vertex, as a file holds them."""
+        """Joints and weights, four per vertex, in the data types of a glTF file."""
         joints, weights = (np.pad(each, ((0, 0), (0, 4 - each.shape[1]))) for each in (self.joints, self.weights))
         return joints.astype("<u1" if len(self.rig.joints) <= 256 else "<u2"), weights.astype(np.float32)
 
 
 def read_rig(path: Path, data: bytes) -> Rig:
-    """The skeleton of a glb or gltf; its joints are those of all skins, in the order of `gltf_attributes.read_skin`.
+    """Read the skeleton of a glb or gltf: the joints of all skins, in the order of `gltf_attributes.read_skin`.
 
-    `InputError`: there is none, it is mirrored or too large, or the file is damaged.
+    `InputError` if there is none, if it is mirrored or too large, or if the file is damaged.
     """
     return understood(path, data, "skeleton makes", _rig)
 
@@ -125,52 +125,55 @@ def _rig(document: Document) -> Rig:
     joints = joint_nodes(document)
     if not joints:
         raise InputError(f"{document.name} has no skin", "a rig has joints, and weights that bind a mesh to them")
-    if len(joints) > MOST_JOINTS:
-        raise InputError(f"{document.name} has {len(joints)} joints, of {MOST_JOINTS} at most", "export one character")
-    list(document.primitives())  # walks through the scene
+    if len(joints) > MAX_JOINTS:
+        raise InputError(f"{document.name} has {len(joints)} joints, of {MAX_JOINTS} at most", "export one character")
+    list(document.primitives())  # fills `document.world`
     chosen = nodes_of_skeleton(document, joints)
-    if len(chosen) > _MOST_NODES * MOST_JOINTS:
+    if len(chosen) > _MAX_NODES_PER_JOINT * MAX_JOINTS:
         raise InputError(f"the skeleton of {document.name} has {len(chosen)} nodes, too many", "export one character")
-    place = {node: k for k, node in enumerate(chosen)}
+    index_of = {node: k for k, node in enumerate(chosen)}
     parent = {int(child): node for node in chosen for child in document.nodes[node].get("children", [])}
     rotations, translations, scales = np.zeros((len(chosen), 4)), np.zeros((len(chosen), 3)), np.ones((len(chosen), 3))
     for k, node in enumerate(chosen):
-        rotations[k], translations[k], scales[k] = _parts(document.name, document.nodes[node])
+        rotations[k], translations[k], scales[k] = _decompose(document.name, document.nodes[node])
     rig = Rig(
         tuple(plain_text(str(document.nodes[node].get("name", ""))) for node in chosen),
-        np.array([place.get(parent.get(node, -1), -1) for node in chosen], np.int64),
-        np.array([place[node] for node in joints], np.int64),
+        np.array([index_of.get(parent.get(node, -1), -1) for node in chosen], np.int64),
+        np.array([index_of[node] for node in joints], np.int64),
         *(rotations, translations, scales),
-        _clips(document, place),
+        _clips(document, index_of),
         tuple(document.nodes[node].get("extras") for node in chosen),
     )
     worlds = rig.worlds()
-    if not (np.isfinite(worlds).all() and np.abs(worlds).max() < _LARGEST):
+    if not (np.isfinite(worlds).all() and np.abs(worlds).max() < _MAX_VALUE):
         raise ValueError("a joint does not stand anywhere")
     return rig
 
 
 def nodes_of_skeleton(document: Document, joints: list[int]) -> list[int]:
-    """Joints, the nodes above them, and those below that hold nothing, parents before children."""
+    """Joints, the nodes above them, and the empty nodes below them, parents before children."""
     if missing := [joint for joint in joints if joint not in document.world]:
         raise ValueError(f"joint {missing[0]} is not in the scene")
     parent = {int(child): node for node in document.world for child in document.nodes[node].get("children", [])}
-    wanted = set(joints)
+    chosen = set(joints)
     for joint in joints:
         above = parent.get(joint)
-        while above is not None and above not in wanted:
-            wanted.add(above)
+        while above is not None and above not in chosen:
+            chosen.add(above)
             above = parent.get(above)
     below = set(joints)
     for node in document.world:
         if parent.get(node) in below and not {"mesh", "camera", "extensions"} & document.nodes[node].keys():
             below.add(node)
-    wanted |= below
-    return [node for node in document.world if node in wanted]
+    chosen |= below
+    return [node for node in document.world if node in chosen]
 
 
-def _parts(name: str, node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
-    """Rotation (x, y, z, w), translation and scale of a node."""
+def _decompose(name: str, node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
+    """Rotation (x, y, z, w), translation and scale of a node; the shear of a matrix is dropped (polar decomposition).
+
+    `InputError` if the scale mirrors.
+    """
     local = local_matrix(node)
     if "matrix" in node:
         left, _, right = np.linalg.svd(local[:3, :3])
@@ -185,7 +188,7 @@ def _parts(name: str, node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
     return Rotation.from_matrix(turn).as_quat(), local[:3, 3], scale
 
 
-def _clips(document: Document, place: dict[int, int]) -> tuple[Clip, ...]:
+def _clips(document: Document, index_of: dict[int, int]) -> tuple[Clip, ...]:
     clips: list[Clip] = []
     arrays: dict[int, Floats] = {}
     keys = 0
@@ -193,7 +196,7 @@ def _clips(document: Document, place: dict[int, int]) -> tuple[Clip, ...]:
         tracks: list[Track] = []
         for channel in animation["channels"]:
             target, sampler = channel["target"], animation["samplers"][channel["sampler"]]
-            node, moves = place.get(target.get("node", -1)), target["path"]
+            node, moves = index_of.get(target.get("node", -1)), target["path"]
             if node is None or moves not in _WIDTHS:
                 continue
             for accessor in (sampler["input"], sampler["output"]):
@@ -201,17 +204,17 @@ def _clips(document: Document, place: dict[int, int]) -> tuple[Clip, ...]:
                     arrays[accessor] = document.accessor(accessor)
             times, values = arrays[sampler["input"]][:, 0], arrays[sampler["output"]]
             interpolation = sampler.get("interpolation", "LINEAR")
-            many = len(times) * (3 if interpolation == "CUBICSPLINE" else 1)
-            if interpolation not in _INTERPOLATIONS or not len(times) or values.shape != (many, _WIDTHS[moves]):
+            n_keys = len(times) * (3 if interpolation == "CUBICSPLINE" else 1)
+            if interpolation not in _INTERPOLATIONS or not len(times) or values.shape != (n_keys, _WIDTHS[moves]):
                 raise ValueError(f"a channel of animation {number} has {values.shape} values for {len(times)} times")
-            if moves == "rotation" and interpolation != "CUBICSPLINE":  # those of few bits are not
+            if moves == "rotation" and interpolation != "CUBICSPLINE":  # quantized quaternions are not of unit length
                 values = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-30)
-            if not (np.abs(values) < _LARGEST).all() or not (np.abs(times) < _LARGEST).all():
+            if not (np.abs(values) < _MAX_VALUE).all() or not (np.abs(times) < _MAX_VALUE).all():
                 raise ValueError(f"animation {number} holds what is not a number")
-            keys += many
-            if keys > _FEW_KEYS + document.size // 4:
-                many_keys = f"the clips of {document.name} have over {_FEW_KEYS:,} keys, many of them shared"
-                raise InputError(many_keys, "export fewer clips, or sample them less often")
+            keys += n_keys
+            if keys > _BASE_KEYS + document.size // 4:
+                message = f"the clips of {document.name} have over {_BASE_KEYS:,} keys, many of them shared"
+                raise InputError(message, "export fewer clips, or sample them less often")
             tracks.append(Track(node, moves, times, values, interpolation))
         if tracks:
             name = plain_text(str(animation.get("name", f"clip {number}")))

@@ -1,4 +1,4 @@
-"""What the extensions of a character (VRM 0.x and 1.0) say about a glTF document by number, kept right when that changes.
+"""Keep the VRM extensions (0.x and 1.0) of a character consistent when numbered entries of its glTF document change.
 
 Specification: VRM Consortium, VRM 0.0; VRMC_vrm 1.0, VRMC_springBone 1.0, VRMC_node_constraint 1.0.
 """
@@ -17,195 +17,202 @@ from meshmatch.shapes.input_files import read_bytes
 
 Json = dict[str, Any]
 SUFFIX = ".vrm"
-OLD, NEW = "VRM", "VRMC_vrm"
-"""The extension of VRM 0.x, and that of 1.0."""
+VRM0, VRM1 = "VRM", "VRMC_vrm"
+"""Extensions of VRM 0.x and of VRM 1.0."""
 SPRINGS, CONSTRAINT = "VRMC_springBone", "VRMC_node_constraint"
-ROOTS = (OLD, NEW, SPRINGS, CONSTRAINT)
-"""Extensions that say something about a whole character."""
+ROOTS = (VRM0, VRM1, SPRINGS, CONSTRAINT)
+"""Extensions that describe a character as a whole."""
 KNOWN = re.compile(
     r"VRM|VRMC_(?:vrm|springBone|springBone_extended_collider|node_constraint|materials_mtoon|materials_hdr\w+)"
 )
-"""Extensions all of whose numbers are among `references`, or stand in materials."""
+"""Extensions whose references by number are all found by `references`, or are in materials."""
 _QUEUES = {"OPAQUE": 2000, "MASK": 2450, "BLEND": 3000}
 
 
 def is_character(json: Json) -> bool:
-    """Whether a document says which of its bones are a person's."""
-    return any(isinstance(json.get("extensions", {}).get(name), dict) for name in (OLD, NEW))
+    """Whether a document has a VRM extension."""
+    return any(isinstance(json.get("extensions", {}).get(name), dict) for name in (VRM0, VRM1))
 
 
 def check_character(file: Path | None, output: Path) -> None:
-    """Refuse a .vrm of what is none (`OptionError`): who made it, and under which licence, nobody could say."""
+    """Raise `OptionError` if `output` is a .vrm but `file` is not a character, since author and license would be unknown.
+
+    Scenes that use GPU instancing are refused as well.
+    """
     if output.suffix.lower() != SUFFIX:
         return
-    name, hint = "the target" if file is None else file.name, "end the name in .glb"
-    found = False, False
+    target_name, hint = "the target" if file is None else file.name, "end the name in .glb"
+    checks = False, False
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
-        found = gltf.understood(
+        checks = gltf.understood(
             file, read_bytes(file), "scene makes", lambda each: (is_character(each.json), each.draws_copies())
         )
-    if not found[0]:
-        raise OptionError(f"{output.name} would be no character: {name} has no VRM extension", hint)
-    if found[1]:
-        raise OptionError(f"{output.name} would be no character: {name} draws copies of one mesh", hint)
+    if not checks[0]:
+        raise OptionError(f"{output.name} would be no character: {target_name} has no VRM extension", hint)
+    if checks[1]:
+        raise OptionError(f"{output.name} would be no character: {target_name} draws copies of one mesh", hint)
 
 
 def references(json: Json) -> Iterator[tuple[str, Any, Any]]:
-    """Kind, holder and key of all numbers in these extensions that stand for a node, mesh, material, texture or image."""
-    for kind, holder, key in (*_old(json), *_new(json)):
-        if isinstance(holder[key], int) and holder[key] >= 0:  # -1 is none
+    """Yield (kind, holder, key) for every reference by number in VRM extensions.
+
+    Kinds are nodes, meshes, materials, textures and images.
+    """
+    for kind, holder, key in (*_vrm0_references(json), *_vrm1_references(json)):
+        if isinstance(holder[key], int) and holder[key] >= 0:  # -1 means none
             yield kind, holder, key
 
 
 def copy_mesh(json: Json, old: int, new: int) -> None:
-    """Let what is said of a mesh count for a copy of it too."""
-    extension = part(json, "extensions", OLD)
-    held = [part(group, "binds") for group in entries(extension, "blendShapeMaster", "blendShapeGroups")]
-    for some in (*held, part(extension, "firstPerson", "meshAnnotations")):
-        if isinstance(some, list):
-            some += [each | {"mesh": new} for each in entries(some) if each.get("mesh") == old]
+    """Apply the expressions and first-person settings of a mesh to a copy of it as well."""
+    extension = nested(json, "extensions", VRM0)
+    lists = [nested(group, "binds") for group in nested_entries(extension, "blendShapeMaster", "blendShapeGroups")]
+    for items in (*lists, nested(extension, "firstPerson", "meshAnnotations")):
+        if isinstance(items, list):
+            items += [each | {"mesh": new} for each in nested_entries(items) if each.get("mesh") == old]
 
 
 def reorder_targets(json: Json, node: int, mesh: int, columns: Sequence[int]) -> None:
-    """Let expressions name the same morph targets of a node, whose mesh no other draws: ``columns`` are the old places of
-    all that it has now, or -1.
+    """Update the morph target indices in expressions after the targets of a node have been reordered.
+
+    No other node may draw the mesh. ``columns`` has the old index of each target that the node has now, or -1.
     """
-    now = {old: new for new, old in enumerate(columns) if old >= 0}
+    new_index = {old: new for new, old in enumerate(columns) if old >= 0}
     for kind, number, bind in _morph_binds(json):
         if number == (mesh if kind == "mesh" else node):
-            bind["index"] = now.get(bind.get("index", -1), bind.get("index"))
+            bind["index"] = new_index.get(bind.get("index", -1), bind.get("index"))
 
 
 def copy_material(json: Json, old: int, new: int) -> None:
-    """Let expressions color a copy of a material too."""
+    """Apply the expressions that change a material to a copy of it as well."""
     for expression in _expressions(json):
         for key in ("materialColorBinds", "textureTransformBinds"):
-            held = expression.get(key)
-            if isinstance(held, list):
-                held += [each | {"material": new} for each in entries(held) if each.get("material") == old]
+            binds = expression.get(key)
+            if isinstance(binds, list):
+                binds += [each | {"material": new} for each in nested_entries(binds) if each.get("material") == old]
 
 
 def complete_properties(json: Json, added: Sequence[Json] = ()) -> None:
-    """Say of materials that are new in a document of VRM 0.x how to draw them: of the last ones what is ``added``, of others
-    that glTF has it.
-    """
-    extension = part(json, "extensions", OLD)
+    """Append the VRM 0.x properties of new materials: ``added`` for the last ones, plain glTF shading for others."""
+    extension = nested(json, "extensions", VRM0)
     if isinstance(extension, dict):
-        held = extension.setdefault("materialProperties", [])
-        for material in json.get("materials", [])[len(held) : len(json.get("materials", [])) - len(added)]:
-            held.append(plain_properties(material))
-        held += copy.deepcopy(list(added))
+        entry_list = extension.setdefault("materialProperties", [])
+        for material in json.get("materials", [])[len(entry_list) : len(json.get("materials", [])) - len(added)]:
+            entry_list.append(plain_properties(material))
+        entry_list += copy.deepcopy(list(added))
 
 
 def plain_properties(material: Json) -> Json:
-    """What VRM 0.x says of a material that is drawn as glTF has it."""
+    """VRM 0.x properties of a material with plain glTF shading."""
     groups = ("floatProperties", "vectorProperties", "textureProperties", "keywordMap", "tagMap")
     entry: Json = {"name": material.get("name", ""), "shader": "VRM_USE_GLTFSHADER"}
     return entry | {"renderQueue": _QUEUES.get(material.get("alphaMode", "OPAQUE"), 2000)} | {key: {} for key in groups}
 
 
 def properties(json: Json) -> list[Json]:
-    """How VRM 0.x draws each material; shorter, or empty, where nothing is said."""
-    return entries(part(json, "extensions", OLD), "materialProperties")
+    """VRM 0.x properties of the materials, in their order; may be shorter than the list of materials, or empty."""
+    return nested_entries(nested(json, "extensions", VRM0), "materialProperties")
 
 
 def show_mesh(json: Json, node: int, mesh: int) -> None:
-    """Let a new mesh be seen from inside the head as the others are, where the document says so of each."""
-    for name, entry in ((OLD, {"mesh": mesh, "firstPersonFlag": "Auto"}), (NEW, {"node": node, "type": "auto"})):
-        held = part(json, "extensions", name, "firstPerson", "meshAnnotations")
-        if isinstance(held, list):
-            held.append(entry)
+    """Add the first-person setting "auto" for a new mesh if the document has such settings."""
+    for name, entry in ((VRM0, {"mesh": mesh, "firstPersonFlag": "Auto"}), (VRM1, {"node": node, "type": "auto"})):
+        annotations = nested(json, "extensions", name, "firstPerson", "meshAnnotations")
+        if isinstance(annotations, list):
+            annotations.append(entry)
 
 
 def moving_textures(json: Json, materials: Mapping[int, str]) -> list[str]:
-    """Names of expressions that move the textures of these materials, by number, over their surface."""
+    """Names of expressions that shift or scale the textures of these materials (names by number)."""
     found = []
-    for group in entries(part(json, "extensions", OLD), "blendShapeMaster", "blendShapeGroups"):
-        values = [each for each in entries(group, "materialValues") if each.get("materialName") in materials.values()]
+    for group in nested_entries(nested(json, "extensions", VRM0), "blendShapeMaster", "blendShapeGroups"):
+        values = [
+            each for each in nested_entries(group, "materialValues") if each.get("materialName") in materials.values()
+        ]
         if any(str(each.get("propertyName")).startswith("_MainTex") for each in values):
             found.append(str(group.get("name", "")))
     for kind in ("preset", "custom"):
-        named = part(json, "extensions", NEW, "expressions", kind)
-        for name, expression in named.items() if isinstance(named, dict) else ():
-            if any(each.get("material") in materials for each in entries(expression, "textureTransformBinds")):
+        expressions = nested(json, "extensions", VRM1, "expressions", kind)
+        for name, expression in expressions.items() if isinstance(expressions, dict) else ():
+            if any(each.get("material") in materials for each in nested_entries(expression, "textureTransformBinds")):
                 found.append(str(name))
     return found
 
 
 def springs_and_constraints(json: Json) -> int:
-    """How many there are that move joints, in either version."""
-    springs = [*entries(json, "extensions", OLD, "secondaryAnimation", "boneGroups")]
-    springs += entries(json, "extensions", SPRINGS, "springs")
+    """Count the springs and constraints that move joints, in either version."""
+    springs = [*nested_entries(json, "extensions", VRM0, "secondaryAnimation", "boneGroups")]
+    springs += nested_entries(json, "extensions", SPRINGS, "springs")
     return len(springs) + sum(CONSTRAINT in node.get("extensions", {}) for node in json["nodes"])
 
 
-def part(held: Any, *keys: str) -> Any:
-    """What lies at the end of these keys; None where there is nothing."""
+def nested(data: Any, *keys: str) -> Any:
+    """Return the value at a path of keys in nested objects; None if it does not exist."""
     for key in keys:
-        held = held.get(key) if isinstance(held, dict) else None
-    return held
+        data = data.get(key) if isinstance(data, dict) else None
+    return data
 
 
-def entries(held: Any, *keys: str) -> list[Json]:
-    """The objects of a list, or the values of an object, at the end of these keys."""
-    found = part(held, *keys)
+def nested_entries(data: Any, *keys: str) -> list[Json]:
+    """Return the objects in the list, or among the values of the object, at a path of keys; empty if there are none."""
+    found = nested(data, *keys)
     found = list(found.values()) if isinstance(found, dict) else found
     return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
 
 
 def _expressions(json: Json) -> list[Json]:
-    """Those of VRM 1.0."""
-    held = part(json, "extensions", NEW, "expressions")
-    return [*entries(held, "preset"), *entries(held, "custom")]
+    """All expressions of VRM 1.0."""
+    expressions = nested(json, "extensions", VRM1, "expressions")
+    return [*nested_entries(expressions, "preset"), *nested_entries(expressions, "custom")]
 
 
 def _morph_binds(json: Json) -> Iterator[tuple[str, Any, Json]]:
-    """What each bind names its morph targets by, "mesh" or "node", its number, and the bind."""
-    for group in entries(part(json, "extensions", OLD), "blendShapeMaster", "blendShapeGroups"):
-        yield from (("mesh", bind.get("mesh"), bind) for bind in entries(group, "binds"))
+    """Yield ("mesh" or "node", its number, bind) for every morph target bind of an expression."""
+    for group in nested_entries(nested(json, "extensions", VRM0), "blendShapeMaster", "blendShapeGroups"):
+        yield from (("mesh", bind.get("mesh"), bind) for bind in nested_entries(group, "binds"))
     for expression in _expressions(json):
-        yield from (("node", bind.get("node"), bind) for bind in entries(expression, "morphTargetBinds"))
+        yield from (("node", bind.get("node"), bind) for bind in nested_entries(expression, "morphTargetBinds"))
 
 
-def _named(kind: str, holders: Sequence[Json], key: str) -> Iterator[tuple[str, Json, str]]:
+def _references_at(kind: str, holders: Sequence[Json], key: str) -> Iterator[tuple[str, Json, str]]:
     return ((kind, holder, key) for holder in holders if key in holder)
 
 
-def _old(json: Json) -> Iterator[tuple[str, Any, Any]]:
-    """Those of VRM 0.x."""
-    extension = part(json, "extensions", OLD)
-    springs = entries(extension, "secondaryAnimation", "boneGroups")
-    single = {key: [held] for key in ("meta", "firstPerson") if isinstance(held := part(extension, key), dict)}
-    yield from _named("textures", single.get("meta", []), "texture")
-    yield from _named("nodes", single.get("firstPerson", []), "firstPersonBone")
-    yield from _named("nodes", entries(extension, "humanoid", "humanBones"), "node")
-    yield from _named("meshes", entries(extension, "firstPerson", "meshAnnotations"), "mesh")
-    for group in entries(extension, "blendShapeMaster", "blendShapeGroups"):
-        yield from _named("meshes", entries(group, "binds"), "mesh")
-    yield from _named("nodes", springs, "center")
-    yield from _named("nodes", entries(extension, "secondaryAnimation", "colliderGroups"), "node")
+def _vrm0_references(json: Json) -> Iterator[tuple[str, Any, Any]]:
+    """The `references` of VRM 0.x."""
+    extension = nested(json, "extensions", VRM0)
+    springs = nested_entries(extension, "secondaryAnimation", "boneGroups")
+    single = {key: [held] for key in ("meta", "firstPerson") if isinstance(held := nested(extension, key), dict)}
+    yield from _references_at("textures", single.get("meta", []), "texture")
+    yield from _references_at("nodes", single.get("firstPerson", []), "firstPersonBone")
+    yield from _references_at("nodes", nested_entries(extension, "humanoid", "humanBones"), "node")
+    yield from _references_at("meshes", nested_entries(extension, "firstPerson", "meshAnnotations"), "mesh")
+    for group in nested_entries(extension, "blendShapeMaster", "blendShapeGroups"):
+        yield from _references_at("meshes", nested_entries(group, "binds"), "mesh")
+    yield from _references_at("nodes", springs, "center")
+    yield from _references_at("nodes", nested_entries(extension, "secondaryAnimation", "colliderGroups"), "node")
     for spring in springs:
         bones = spring.get("bones")
         yield from (("nodes", bones, k) for k in range(len(bones) if isinstance(bones, list) else 0))
     for entry in properties(json):
-        textures = part(entry, "textureProperties")
+        textures = nested(entry, "textureProperties")
         yield from (("textures", textures, key) for key in (textures if isinstance(textures, dict) else ()))
 
 
-def _new(json: Json) -> Iterator[tuple[str, Any, Any]]:
-    """Those of VRM 1.0."""
-    extension, springs = (part(json, "extensions", name) for name in (NEW, SPRINGS))
-    meta = part(extension, "meta")
-    yield from _named("images", [meta] if isinstance(meta, dict) else [], "thumbnailImage")
-    yield from _named("nodes", entries(extension, "humanoid", "humanBones"), "node")
-    yield from _named("nodes", entries(extension, "firstPerson", "meshAnnotations"), "node")
+def _vrm1_references(json: Json) -> Iterator[tuple[str, Any, Any]]:
+    """The `references` of VRM 1.0."""
+    extension, springs = (nested(json, "extensions", name) for name in (VRM1, SPRINGS))
+    meta = nested(extension, "meta")
+    yield from _references_at("images", [meta] if isinstance(meta, dict) else [], "thumbnailImage")
+    yield from _references_at("nodes", nested_entries(extension, "humanoid", "humanBones"), "node")
+    yield from _references_at("nodes", nested_entries(extension, "firstPerson", "meshAnnotations"), "node")
     for expression in _expressions(json):
-        yield from _named("nodes", entries(expression, "morphTargetBinds"), "node")
+        yield from _references_at("nodes", nested_entries(expression, "morphTargetBinds"), "node")
         for key in ("materialColorBinds", "textureTransformBinds"):
-            yield from _named("materials", entries(expression, key), "material")
-    yield from _named("nodes", entries(springs, "colliders"), "node")
-    for spring in entries(springs, "springs"):
-        yield from _named("nodes", entries(spring, "joints"), "node")
-        yield from _named("nodes", [spring], "center")
+            yield from _references_at("materials", nested_entries(expression, key), "material")
+    yield from _references_at("nodes", nested_entries(springs, "colliders"), "node")
+    for spring in nested_entries(springs, "springs"):
+        yield from _references_at("nodes", nested_entries(spring, "joints"), "node")
+        yield from _references_at("nodes", [spring], "center")
     for node in json.get("nodes", []):
-        yield from _named("nodes", entries(node, "extensions", CONSTRAINT, "constraint"), "source")
+        yield from _references_at("nodes", nested_entries(node, "extensions", CONSTRAINT, "constraint"), "source")
