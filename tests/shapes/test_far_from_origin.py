@@ -160,7 +160,7 @@ def test_a_glb_that_would_be_larger_than_one_can_be_is_refused(
     held = path.read_bytes()
     assert Editor(Document(path, held)).to_bytes() == held
     path.unlink()
-    monkeypatch.setattr(gltf_out, "_LARGEST", len(held) - 1)
+    monkeypatch.setattr(gltf_out, "_MAX_BYTES", len(held) - 1)
     with pytest.raises(OutputError, match="becomes larger than a glb can be"):
         write_morphs(path, sphere, targets)
     with pytest.raises(OutputError, match=r"sequence\.glb becomes larger than a glb can be"):

@@ -230,7 +230,7 @@ def test_what_is_no_label_map_is_told_in_words(tmp_path: Path, case: str) -> Non
 def test_labels_all_over_the_image_are_refused_before_hours_of_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("meshmatch.shapes.formats.label_surfaces._MOST_WORK", 3 * LABELS.size)
+    monkeypatch.setattr("meshmatch.shapes.formats.label_surfaces._MAX_BOX_VOXELS", 3 * LABELS.size)
     corners = np.zeros(SIZES, int)
     for k in range(5):
         corners[2 * k : 2 * k + 2, 1:3, 1:3] = corners[-2 * k - 3 : -2 * k - 1, -3:-1, -3:-1] = k + 1

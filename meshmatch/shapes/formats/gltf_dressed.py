@@ -71,9 +71,7 @@ def dressed(
                 continue
             primitive = mesh["primitives"][k]
             V = document.count(part["attributes"]["POSITION"])
-            split = (
-                (np.arange(V), base_color_uv(document, part), faces) if own else split_at_seams(V, faces, corners)
-            )
+            split = (np.arange(V), base_color_uv(document, part), faces) if own else split_at_seams(V, faces, corners)
             unchanged = own and not transform_of(document, part)
             moved_to = None if unchanged else _set_first_uv(editor, document, V, primitive, split)
             _disable_vertex_colors(document, part, primitive)

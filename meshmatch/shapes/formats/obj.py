@@ -1,5 +1,7 @@
-"""Wavefront OBJ: positions and faces, and textured meshes to be written. Texture and normal indices are ignored when a
-shape is read, so seams split nothing; what lies on the faces is read by `meshmatch.shapes.formats.obj_look`.
+"""Read and write Wavefront OBJ files: positions, faces and vertex colors; textured meshes are written only.
+
+Reading ignores texture and normal indices, so that seams do not split vertices; `meshmatch.shapes.formats.obj_look` reads
+texture coordinates and materials.
 """
 
 from __future__ import annotations
@@ -27,16 +29,16 @@ _ENTRIES = (
     rb"d|tr|k[ade]|ks|ns|ni|tf|bump|disp|decal|refl|norm|map_\w+"
 )
 _ENDS_IN_BACKSLASH = re.compile(rb"\\[ \t]*(?:\n|\Z)")
-_LINE_THAT_GOES_ON = re.compile(rb"^[^\n]*\\[ \t]*$", re.MULTILINE)
-_GOES_ON = re.compile(rb"\\[ \t]*\n(?![ \t]*(?:" + _ENTRIES + rb")[ \t])", re.IGNORECASE)
+_CONTINUED_LINE = re.compile(rb"^[^\n]*\\[ \t]*$", re.MULTILINE)
+_CONTINUATION = re.compile(rb"\\[ \t]*\n(?![ \t]*(?:" + _ENTRIES + rb")[ \t])", re.IGNORECASE)
 _COMMENT = re.compile(rb"(?:^|[ \t])#")
-SLASH_APART = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
+SPACED_SLASH = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
 _MIXED_CORNERS = re.compile(rb"/[ \t]++[^\s/]++(?!/)")
 _POLYPAINT = re.compile(rb"(?:[0-9a-fA-F]{8})+")
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """One vertex per ``v`` line, in their order; with colors where six numbers are given."""
+    """Read one vertex per ``v`` line, in file order, and vertex colors if there are any (see `_colors`)."""
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
@@ -62,9 +64,9 @@ def read(path: Path, data: bytes) -> Raw:
 def vertices_of_corners(
     name: str, faces: bytes, sizes: Int[Ints, " P"], vertex_lines: Int[Ints, " V"], face_lines: Int[Ints, " P"]
 ) -> Int[Ints, " N"]:
-    """The vertex, from 0, at each corner of all faces, which are as `entries_and_faces` finds them."""
+    """0-based vertex index at each corner of all faces; `faces`, `sizes` and lines are those of `entries_and_faces`."""
     if b"/" in faces:
-        faces = re.sub(rb"/\S*", b"", faces)  # position/texture/normal: the first alone
+        faces = re.sub(rb"/\S*", b"", faces)  # of position/texture/normal, only the position
     corners = parse_numbers(name, faces)
     if len(corners) != sizes.sum():
         raise damaged(name, "a corner of a face has no vertex before its slash")
@@ -74,105 +76,113 @@ def vertices_of_corners(
 
 
 def joined_lines(data: bytes) -> bytes:
-    """Text whose lines end in a newline, and go on where one ended in a backslash.
+    r"""Normalize line ends to \n and join lines that are continued by a backslash.
 
-    A comment ends with its line, also one that ends in a backslash, as a path may; and a line that begins with the word of
-    an entry is one of its own, so that a name that ends in a backslash does not swallow it.
+    A comment is not continued, even if it ends in a backslash, as a path may. A line that begins with the keyword of an
+    entry is not a continuation, so that a name that ends in a backslash does not swallow it.
     """
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\\" not in data or not _ENDS_IN_BACKSLASH.search(data):
         return data
-    data = _LINE_THAT_GOES_ON.sub(_comment_ended, data)
-    return _ENDS_IN_BACKSLASH.sub(b"\n", _GOES_ON.sub(b" ", data))
+    data = _CONTINUED_LINE.sub(_without_continuation, data)
+    return _ENDS_IN_BACKSLASH.sub(b"\n", _CONTINUATION.sub(b" ", data))
 
 
-def _comment_ended(line: re.Match[bytes]) -> bytes:
+def _without_continuation(line: re.Match[bytes]) -> bytes:
+    """Remove the final backslash of a line if the line has a comment."""
     return line[0].rstrip(b"\\ \t") if _COMMENT.search(line[0]) else line[0]
 
 
 def _colors(name: str, data: bytes, values: Floats, counts: Ints) -> Floats | None:
-    """(V, 4) colors of vertices: as numbers behind their positions, as lines of their own, or as ZBrush writes them."""
-    painted = counts >= 6
-    if painted.any():
+    """(V, 4) vertex colors from numbers after the positions, ZBrush polypaint (``#MRGB``) or ``vc`` lines, or None."""
+    has_color = counts >= 6
+    if has_color.any():
         width = 4 if (counts == 7).all() else 3
-        starts = (np.cumsum(counts) - counts)[painted]
-        found = formats.painted(values[starts[:, None] + np.arange(3, 3 + width)])
-        if painted.all():
-            return found
+        starts = (np.cumsum(counts) - counts)[has_color]
+        parsed = formats.painted(values[starts[:, None] + np.arange(3, 3 + width)])
+        if has_color.all():
+            return parsed
         colors = np.ones((len(counts), 4))
-        colors[painted] = found
+        colors[has_color] = parsed
         return colors
     if b"#MRGB" in data:
-        # Eight digits a vertex: mask, red, green, blue. The mask says what ZBrush may change, and is no part of the look.
+        # Eight hexadecimal digits per vertex: mask, red, green, blue. The mask protects vertices from edits in ZBrush.
         rows = formats.lines_starting_with(data, b"#MRGB")[0][0].split()
         if not all(map(_POLYPAINT.fullmatch, rows)):
             warn(f"{name} has polypaint (#MRGB) that is not of eight hexadecimal digits a vertex; it is left out")
             return None
         masked = np.frombuffer(bytes.fromhex(b"".join(rows).decode()), np.uint8).reshape(-1, 4)
-        return _for_all(name, "polypaint (#MRGB)", masked[:, 1:] / 255.0, len(counts))
+        return _fill_colors(name, "polypaint (#MRGB)", masked[:, 1:] / 255.0, len(counts))
     if b"\nvc " in data:
         [(text, lines)] = formats.lines_starting_with(formats.without_comments(data), b"vc")
-        own = words_per_line(text)
-        if len(own) == len(lines) and len(own) and own.min() >= 3:
-            return _for_all(
-                name, "colors (vc)", formats.painted(columns(parse_numbers(name, text), own, 0, 3)), len(counts)
+        counts_per_line = words_per_line(text)
+        if len(counts_per_line) == len(lines) and len(counts_per_line) and counts_per_line.min() >= 3:
+            return _fill_colors(
+                name,
+                "colors (vc)",
+                formats.painted(columns(parse_numbers(name, text), counts_per_line, 0, 3)),
+                len(counts),
             )
     return None
 
 
-def _for_all(name: str, what: str, found: Floats, count: int) -> Floats | None:
-    """Colors that are listed apart, white where there are fewer of them than vertices."""
-    if len(found) == 0:
+def _fill_colors(name: str, what: str, colors_given: Floats, count: int) -> Floats | None:
+    """Return (count, 4) colors from a separate list, with a warning if its length differs; missing colors are white."""
+    if len(colors_given) == 0:
         return None
-    if len(found) != count:
-        rest = "others are white" if len(found) < count else "what is too much is left out"
-        warn(f"{name} has {what} for {len(found):,} vertices, but {count:,} of these: {rest}")
+    if len(colors_given) != count:
+        rest = "others are white" if len(colors_given) < count else "what is too much is left out"
+        warn(f"{name} has {what} for {len(colors_given):,} vertices, but {count:,} of these: {rest}")
     colors = np.ones((count, 4))
-    colors[: len(found), : found.shape[1]] = found[:count]
+    colors[: len(colors_given), : colors_given.shape[1]] = colors_given[:count]
     return colors
 
 
 def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints, bytes, Ints, Ints]:
-    """Text and lines of the entries that begin with a word; text, sizes and lines of faces.
+    """Find the entries that begin with a word, and the faces.
 
-    Faces of the old spelling ``fo`` come last.
+    Returns the text and line numbers of the entries, then the text, corner counts and line numbers of the faces. Faces in
+    the old spelling ``fo`` come last.
     """
     data = formats.without_comments(data)
-    (text, listed), (faces, lines), (old, old_lines) = formats.lines_starting_with(data, word, b"f", b"fo")
+    (text, entry_lines), (faces, face_lines), (old_faces, old_lines) = formats.lines_starting_with(
+        data, word, b"f", b"fo"
+    )
     if len(old_lines):
-        faces, lines = faces + b"\n" + old, np.concatenate([lines, old_lines])
+        faces, face_lines = faces + b"\n" + old_faces, np.concatenate([face_lines, old_lines])
     if b" /" in faces or b"\t/" in faces:  # 1 / 2 is the corner 1/2
-        faces = SLASH_APART.sub(rb"\1", faces)
+        faces = SPACED_SLASH.sub(rb"\1", faces)
     if (b"/ " in faces or b"/\t" in faces) and _MIXED_CORNERS.search(faces):
         raise damaged(name, "a face has a slash at the end of one corner, and none at the next: where do they end?")
     sizes = words_per_line(faces)
-    if len(sizes) < len(lines):
+    if len(sizes) < len(face_lines):
         raise damaged(name, "a face has no corners")
-    return text, listed, faces, sizes, lines
+    return text, entry_lines, faces, sizes, face_lines
 
 
 def from_one(
-    name: str, what: str, values: Float[Floats, " N"], listed: Int[Ints, " M"], lines: Int[Ints, " N"]
+    name: str, what: str, values: Float[Floats, " N"], entry_lines: Int[Ints, " M"], lines: Int[Ints, " N"]
 ) -> Int[Ints, " N"]:
-    """Numbers of faces that count from 1, also those that counted backwards from the last entry before their line.
+    """Resolve indices of faces to positive 1-based ones; negative ones count back from the last entry before their line.
 
-    `values` are as the faces have them (0 stays 0), on the `lines` of these; `listed` are the lines of the entries.
+    `values` are the indices in the file (0 stays 0) and `lines` the lines where they occur; `entry_lines` are the lines of
+    the entries that they refer to.
     """
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
         raise damaged(name, f"a face refers to a {what} that is not a whole number")
     index = values.astype(np.int64)
     if (index < 0).any():
-        behind = index < 0
-        index[behind] += np.searchsorted(listed, lines[behind]) + 1
-        index[behind & (index < 1)] = len(listed) + 1  # before the first one
-    if len(index) and index.max() > len(listed):
-        raise damaged(name, f"a face refers to {what} {index.max()}, but there are only {len(listed)}")
+        is_negative = index < 0
+        index[is_negative] += np.searchsorted(entry_lines, lines[is_negative]) + 1
+        index[is_negative & (index < 1)] = len(entry_lines) + 1  # before the first entry: an error
+    if len(index) and index.max() > len(entry_lines):
+        raise damaged(name, f"a face refers to {what} {index.max()}, but there are only {len(entry_lines)}")
     return index
 
 
 def write(path: Path, shape: Shape) -> None:
-    """Positions with every digit that they have."""
+    """Write a mesh or a point cloud, with positions in full precision."""
     verts = shape.verts_or_nan
     rows = verts if shape.colors is None else np.hstack([verts, shape.colors[:, :3]])
     lines = ["v " + " ".join(map(repr, row)) for row in rows.tolist()]
@@ -180,9 +190,9 @@ def write(path: Path, shape: Shape) -> None:
 
 
 def write_textured(path: Path, mesh: formats.Textured, mtl: str, material: str) -> None:
-    """Vertices and faces exactly as they are, texture coordinates listed apart: seams split nothing.
+    """Write a textured mesh; texture coordinates are indexed separately, so that seams do not split vertices.
 
-    `mtl` is the name of the material file beside it, `material` that of the only material in it.
+    `mtl` is the name of the material file in the same folder, `material` that of its only material.
     """
     unique, index = np.unique(mesh.uv.reshape(-1, 2).astype("<f4"), axis=0, return_inverse=True)
     lines = [f"mtllib {mtl}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.verts.tolist())]
@@ -197,19 +207,22 @@ def _write(path: Path, lines: list[str]) -> None:
 
 
 def write_materials(path: Path, names: Iterable[str], material: BakedMaterial, images: Mapping[str, str]) -> None:
-    """The mtl: materials of these names that are all the same. ``images`` has file names by what they show: "color", and
-    maybe "normal", "roughness", "metal" and "emission".
+    """Write an mtl file with several materials that differ only in their names.
 
-    Metal, roughness, light and normals as most programs read them. Options of maps are not known to every reader, and left
-    out, all but the strength of normal maps: Blender imports them with strength 0 where it is not given.
+    ``images`` has the names of the image files: "color", and optionally "normal", "roughness", "metal" and "emission".
+    Metalness, roughness, emission and normals are written with the keywords that most programs read. Options of maps are
+    left out, since not every reader knows them, except for the strength of normal maps: without it, Blender imports them
+    with strength 0.
     """
-    paint = ["Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {images['color']}"]
+    properties = ["Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "d 1", "illum 1", f"map_Kd {images['color']}"]
     if material.alpha != "opaque":
-        paint.append(f"map_d {images['color']}")
+        properties.append(f"map_d {images['color']}")
     if (material.roughness, material.metal) != (1.0, 0.0) or "roughness" in images:
-        paint += [f"Pr {material.roughness:.6g}", f"Pm {material.metal:.6g}"]
+        properties += [f"Pr {material.roughness:.6g}", f"Pm {material.metal:.6g}"]
     if max(material.light) > 0:
-        paint.append("Ke {:.6g} {:.6g} {:.6g}".format(*material.light))
-    words = (("roughness", "map_Pr"), ("metal", "map_Pm"), ("emission", "map_Ke"), ("normal", "norm"))
-    paint += [f"{word} {images[what]}" for what, word in (*words, ("normal", "map_Bump -bm 1")) if what in images]
-    _write(path, [line for name in names for line in (f"newmtl {name}", *paint)])
+        properties.append("Ke {:.6g} {:.6g} {:.6g}".format(*material.light))
+    keywords = (("roughness", "map_Pr"), ("metal", "map_Pm"), ("emission", "map_Ke"), ("normal", "norm"))
+    properties += [
+        f"{keyword} {images[what]}" for what, keyword in (*keywords, ("normal", "map_Bump -bm 1")) if what in images
+    ]
+    _write(path, [line for name in names for line in (f"newmtl {name}", *properties)])

@@ -1,5 +1,6 @@
-"""The text of an OBJ file with other positions, or other texture coordinates and materials: groups, polygons, comments and
-order stay.
+"""Edit the text of an OBJ file: replace positions, colors, texture coordinates or materials.
+
+Groups, polygons, comments and order are kept.
 """
 
 from __future__ import annotations
@@ -15,19 +16,19 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import unit
 from meshmatch.shapes.formats import columns, lines_starting_with, parse_numbers, without_comments, words_per_line
-from meshmatch.shapes.formats.obj import SLASH_APART, entries_and_faces, from_one, joined_lines, vertices_of_corners
+from meshmatch.shapes.formats.obj import SPACED_SLASH, entries_and_faces, from_one, joined_lines, vertices_of_corners
 from meshmatch.shapes.formats.polygons import triangles_of
 
 _GAP = rb"[ \t]++"
-_WORD = rb"\S++"
+_TOKEN = rb"\S++"
 _NUMBERS = {
     word: re.compile(
-        rb"^([ \t]*+" + word + _GAP + rb")" + _WORD + rb"(" + _GAP + rb")" + _WORD + rb"(" + _GAP + rb")" + _WORD,
+        rb"^([ \t]*+" + word + _GAP + rb")" + _TOKEN + rb"(" + _GAP + rb")" + _TOKEN + rb"(" + _GAP + rb")" + _TOKEN,
         re.MULTILINE,
     )
     for word in (b"v", b"vn")
 }
-_FACES = (b"f", b"fo")
+_FACE_KEYWORDS = (b"f", b"fo")
 _VERTEX = re.compile(rb"^([ \t]*+v" + 3 * (_GAP + rb"[^\s#]++") + rb")[^\n#]*", re.MULTILINE)
 _WITHOUT_NORMAL = re.compile(rb"(?<!\S)[^\s/]++(?:/[^\s/]*+)?+/?+(?=\s|\Z)")
 _UP_TO_NORMAL = re.compile(rb"[^\s/]++/[^\s/]*+/")
@@ -36,24 +37,24 @@ _UP_TO_NORMAL = re.compile(rb"[^\s/]++/[^\s/]*+/")
 def with_positions(
     name: str, data: bytes, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"] | None = None
 ) -> bytes:
-    """The bytes of an obj whose vertices have moved.
+    """Return the bytes of an obj with new vertex positions.
 
     Parameters
     ----------
     name
-        Of the file, for errors.
+        Name of the file, for errors.
     data
-        What `obj.read` made V vertices of. Lines that go on in the next one are joined.
+        Bytes of the file, from which `obj.read` reads V vertices. Continued lines are joined.
     verts
-        Where the vertices are now; a line whose row is not finite stays.
+        New positions; lines of vertices with a row that is not finite are not changed.
     turns
-        The rotation around each vertex, which the normals (``vn``) follow, so that hard edges stay hard. Without it,
-        they stay.
+        Rotation at each vertex, which is applied to the normals (``vn``), so that hard edges stay hard. Without it,
+        normals are not changed.
 
     Returns
     -------
     bytes
-        The same text, but for three numbers in each ``v`` line, and in each ``vn`` line that a face uses.
+        The text, with three new numbers in each ``v`` line, and in each ``vn`` line that a face uses.
 
     Raises
     ------
@@ -62,134 +63,140 @@ def with_positions(
     """
     joined = joined_lines(data)
     if joined.replace(b"\n", b"") != data.replace(b"\r", b"").replace(b"\n", b"") or b"\n" not in data:
-        data = joined  # lines that go on, or that end in a lone carriage return
-    moved = _replaced(data, b"v", verts, "%.12g")
-    if moved is None:
+        data = joined  # it has continued lines, or lines that end in a lone carriage return
+    new_text = _replace_numbers(data, b"v", verts, "%.12g")
+    if new_text is None:
         raise InputError(f"cannot tell the vertices of {name} apart", "export it again, one 'v' line for each")
     if turns is None or b"vn" not in data:
-        return moved
+        return new_text
     normals = _turned_normals(name, joined, turns)
-    return _replaced(moved, b"vn", normals, "%.6g") or moved
+    return _replace_numbers(new_text, b"vn", normals, "%.6g") or new_text
 
 
 @dataclass(frozen=True, eq=False)
 class Polygons:
-    """The faces of an obj as its text has them, and the corners of their triangles among all corners, (F, 3)."""
+    """Polygons of an obj: the corner count of each, and their triangulation as indices into all corners."""
 
     sizes: Int[Ints, " P"]
     triangles: Int[Ints, "F 3"]
 
     @property
     def of_triangles(self) -> Int[Ints, " F"]:
-        """The polygon that each triangle is a part of."""
+        """Index of the polygon that each triangle belongs to."""
         return np.repeat(np.arange(len(self.sizes)), np.maximum(self.sizes - 2, 0))
 
 
 def polygons_of(name: str, data: bytes, verts: Float[Floats, "V 3"]) -> Polygons:
-    """The faces of a text that `obj.read` made V vertices of."""
+    """Return the polygons of an obj; `verts` are its V vertices as read by `obj.read`."""
     _, vertex_lines, faces, sizes, face_lines = entries_and_faces(name, joined_lines(data), b"v")
     corners = vertices_of_corners(name, faces, sizes, vertex_lines, face_lines)
     return Polygons(sizes, triangles_of(name, verts, corners, sizes))
 
 
 def with_material(data: bytes, library: str, material: str, uv: Float[Floats, "N 2"] | None) -> tuple[bytes, list[str]]:
-    """The bytes of an obj that wears other materials, and the names of those that its faces use.
+    """Return the bytes of an obj with another material library, and the names of the materials that its faces use.
 
     Parameters
     ----------
     data
-        The text. Lines that go on in the next one are joined.
+        Bytes of the file. Continued lines are joined.
     library
-        The file of its materials, which takes the place of others.
+        Name of the new material file, which replaces all others.
     material
-        The name of the material of faces that have none.
+        Name of the material for faces that have none.
     uv
-        Texture coordinates of each corner of its faces, v up, which take the place of others; None to leave those.
+        New texture coordinates of each face corner, v up, which replace the old ones; None to keep the old ones.
     """
     lines = joined_lines(data).split(b"\n")
     words = [line.split(None, 1)[:1] for line in lines]
-    kinds = [word[0] if word else b"" for word in words]
-    faces = [k for old in _FACES for k, kind in enumerate(kinds) if kind == old]  # as readers count them
-    before: list[bytes] = []
+    keywords = [word[0] if word else b"" for word in words]
+    # in the order of `entries_and_faces`
+    faces = [k for old in _FACE_KEYWORDS for k, keyword in enumerate(keywords) if keyword == old]
+    new_lines: list[bytes] = []
     if uv is not None:
         unique, index = np.unique(uv.astype("<f4"), axis=0, return_inverse=True)
-        before = [b"vt %.9g %.9g" % (u, v) for u, v in unique.tolist()]
-        numbers = iter((index.reshape(-1) + 1).tolist())
+        new_lines = [b"vt %.9g %.9g" % (u, v) for u, v in unique.tolist()]
+        uv_indices = iter((index.reshape(-1) + 1).tolist())
         for k in faces:
-            lines[k] = _laid(lines[k], numbers)
-    named = [k for k, kind in enumerate(kinds) if kind == b"usemtl"]
-    names = dict.fromkeys(lines[k].split(None, 1)[-1].strip().decode("utf-8", "surrogateescape") for k in named)
+            lines[k] = _with_uv_indices(lines[k], uv_indices)
+    usemtl_lines = [k for k, keyword in enumerate(keywords) if keyword == b"usemtl"]
+    names = dict.fromkeys(lines[k].split(None, 1)[-1].strip().decode("utf-8", "surrogateescape") for k in usemtl_lines)
     first = min(faces, default=len(lines))
-    if min(named, default=first) >= first:
-        before.append(b"usemtl " + material.encode("utf-8", "surrogateescape"))
+    if min(usemtl_lines, default=first) >= first:
+        new_lines.append(b"usemtl " + material.encode("utf-8", "surrogateescape"))
         names[material] = None
-    gone = (b"mtllib",) if uv is None else (b"mtllib", b"vt")
-    kept = [line for line, kind in zip(lines[:first], kinds, strict=False) if kind not in gone]
-    rest = [line for line, kind in zip(lines[first:], kinds[first:], strict=True) if kind not in gone]
-    head = b"mtllib " + library.encode("utf-8", "surrogateescape")
-    return b"\n".join([head, *kept, *before, *rest]), list(names)
+    removed = (b"mtllib",) if uv is None else (b"mtllib", b"vt")
+    before_faces = [line for line, keyword in zip(lines[:first], keywords, strict=False) if keyword not in removed]
+    rest = [line for line, keyword in zip(lines[first:], keywords[first:], strict=True) if keyword not in removed]
+    library_line = b"mtllib " + library.encode("utf-8", "surrogateescape")
+    return b"\n".join([library_line, *before_faces, *new_lines, *rest]), list(names)
 
 
 def with_colors(name: str, data: bytes, colors: Float[Floats, "V 4"]) -> bytes:
-    """The bytes of an obj with other colors of its vertices (sRGB, 0..1), behind their positions."""
+    """Return the bytes of an obj with new vertex colors (sRGB, 0..1), written after the positions."""
     number = count()
 
-    def painted(found: re.Match[bytes]) -> bytes:
+    def with_color(found: re.Match[bytes]) -> bytes:
         k = next(number)
         return found[0] if k >= len(colors) else b"%b %.6g %.6g %.6g" % (found[1], *rows[k])
 
     rows = colors[:, :3].tolist()
-    text = _VERTEX.sub(painted, joined_lines(data))
+    text = _VERTEX.sub(with_color, joined_lines(data))
     if next(number) != len(colors):
         raise InputError(f"cannot tell the vertices of {name} apart", "export it again, one 'v' line for each")
     return text
 
 
 def beyond_triangles(name: str, data: bytes) -> list[str]:
-    """What a text has besides the triangles of one mesh and its material, in words."""
+    """Kinds of content besides the triangles of one mesh with one material, in words ("polygons", "groups", ...)."""
     data = joined_lines(data)
     normals, _, sizes = entries_and_faces(name, data, b"vn")[1:4]
     groups, objects, materials = lines_starting_with(without_comments(data), b"g", b"o", b"usemtl")
-    there = {
+    present = {
         "polygons": bool(len(sizes)) and int(sizes.max()) > 3,
         "groups": len(groups[1]) + len(objects[1]) > 1,
         "materials": len({name.strip() for name in materials[0].split(b"\n")} - {b""}) > 1,
         "normals": len(normals) > 0,
     }
-    return [word for word, known in there.items() if known]
+    return [word for word, is_present in present.items() if is_present]
 
 
-def _laid(line: bytes, pairs: Iterator[int]) -> bytes:
-    """A line of a face with other numbers of texture coordinates."""
-    line, sharp, comment = line.partition(b"#")
-    word, *corners = SLASH_APART.sub(rb"\1", line.strip()).split()
+def _with_uv_indices(line: bytes, uv_indices: Iterator[int]) -> bytes:
+    """Replace the texture coordinate indices of a face line by the next ones of `uv_indices`."""
+    line, hash_sign, comment = line.partition(b"#")
+    word, *corners = SPACED_SLASH.sub(rb"\1", line.strip()).split()
     out = [word]
     for corner in corners:
         vertex, _, rest = corner.partition(b"/")
         normal = rest.partition(b"/")[2]
-        out.append(b"%b/%d/%b" % (vertex, next(pairs), normal) if normal else b"%b/%d" % (vertex, next(pairs)))
-    return b" ".join(out) + (b" " + sharp + comment if sharp else b"")
+        out.append(
+            b"%b/%d/%b" % (vertex, next(uv_indices), normal) if normal else b"%b/%d" % (vertex, next(uv_indices))
+        )
+    return b" ".join(out) + (b" " + hash_sign + comment if hash_sign else b"")
 
 
-def _replaced(data: bytes, word: bytes, rows: Floats, form: str) -> bytes | None:
-    """The text with other numbers in the lines of a word, or None if there is not a line for each row."""
-    line = form.encode().join([rb"%b", rb"%b", rb"%b", rb""])
-    kept: list[bool] = np.asarray(np.isfinite(rows).all(axis=1)).tolist()
-    values, number = rows.tolist(), count()
+def _replace_numbers(data: bytes, word: bytes, rows: Floats, number_format: str) -> bytes | None:
+    """Replace the first three numbers of all lines that begin with `word`; None unless there is one line per row.
 
-    def moved(found: re.Match[bytes]) -> bytes:
-        k = next(number)
-        if k >= len(values) or not kept[k]:
+    Lines whose row is not finite are kept.
+    """
+    line = number_format.encode().join([rb"%b", rb"%b", rb"%b", rb""])
+    is_finite: list[bool] = np.asarray(np.isfinite(rows).all(axis=1)).tolist()
+    values, counter = rows.tolist(), count()
+
+    def replacement(found: re.Match[bytes]) -> bytes:
+        k = next(counter)
+        if k >= len(values) or not is_finite[k]:
             return found[0]
         (x, y, z), (start, first, second) = values[k], found.groups()
         return line % (start, x, first, y, second, z)
 
-    text = _NUMBERS[word].sub(moved, data)
-    return text if next(number) == len(values) else None
+    text = _NUMBERS[word].sub(replacement, data)
+    return text if next(counter) == len(values) else None
 
 
 def _turned_normals(name: str, data: bytes, turns: Float[Floats, "V 3 3"]) -> Float[Floats, "N 3"]:
-    """The normals of a text, each turned as the vertices are whose corners have it; NaN where no corner has."""
+    """Rotate the normals (``vn``) with the vertices whose corners use them (averaged); NaN for unused normals."""
     text, lines, faces, sizes, face_lines = entries_and_faces(name, data, b"vn")
     counts = words_per_line(text)
     if len(counts) < len(lines) or (len(counts) and counts.min() < 3):
@@ -197,16 +204,16 @@ def _turned_normals(name: str, data: bytes, turns: Float[Floats, "V 3 3"]) -> Fl
     normals = columns(parse_numbers(name, text), counts, 0, 3)
     vertex_lines = entries_and_faces(name, data, b"v")[1]
     vertices = vertices_of_corners(name, faces, sizes, vertex_lines, face_lines)
-    third: Ints = from_one(
+    normal_of_corner: Ints = from_one(
         name,
         "normal",
         parse_numbers(name, _UP_TO_NORMAL.sub(b"", _WITHOUT_NORMAL.sub(b"0", faces))),
         lines,
         np.repeat(face_lines, sizes),
     )
-    used = np.flatnonzero(third > 0)
-    which = third[used] - 1
-    turned = np.full(normals.shape, np.nan)
-    turned[which] = 0.0
-    np.add.at(turned, which, np.einsum("nij,nj->ni", turns[vertices[used]], normals[which]))
-    return unit(turned)
+    used_corners = np.flatnonzero(normal_of_corner > 0)
+    normal_index = normal_of_corner[used_corners] - 1
+    rotated = np.full(normals.shape, np.nan)
+    rotated[normal_index] = 0.0
+    np.add.at(rotated, normal_index, np.einsum("nij,nj->ni", turns[vertices[used_corners]], normals[normal_index]))
+    return unit(rotated)
