@@ -139,13 +139,13 @@ def test_polygons_of_too_many_corners_are_said() -> None:
 
     points = crescent(200)
     assert split(points) == pytest.approx(abs(shoelace(points)))
-    points = crescent(polygons.MOST_CORNERS // 2 + 1)
+    points = crescent(polygons.MAX_CORNERS // 2 + 1)
     with pytest.warns(MeshmatchWarning, match="moon.ply: a polygon has too many corners"):
         assert split(points) > 1.5 * abs(shoelace(points))
 
 
 def test_the_work_on_one_file_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(polygons, "MOST_TESTS", 2 * len(COMB) ** 2)
+    monkeypatch.setattr(polygons, "MAX_TESTS", 2 * len(COMB) ** 2)
     verts = np.concatenate([in_space(COMB, k) for k in range(5)])
     with pytest.warns(MeshmatchWarning, match="3 polygons have too many corners"):
         triangles_of("a", verts, np.arange(len(verts)), np.full(5, len(COMB)))
@@ -153,8 +153,8 @@ def test_the_work_on_one_file_is_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_quads_are_split_together(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
-    ears = polygons._ears
-    monkeypatch.setattr(polygons, "_ears", lambda places, sizes: [calls.append(len(sizes)), ears(places, sizes)][1])
+    ears = polygons._clip_ears
+    monkeypatch.setattr(polygons, "_clip_ears", lambda places, sizes: [calls.append(len(sizes)), ears(places, sizes)][1])
     rng = np.random.default_rng(0)
     verts = rng.normal(size=(100_000, 3))
     corners, sizes = rng.integers(0, len(verts), 4 * 50_000), np.full(50_000, 4)

@@ -1,7 +1,7 @@
-"""VTK's XML files of surfaces (.vtp, .vtu), as ParaView, 3D Slicer and PyVista write them.
+"""Read VTK's XML files of surfaces (.vtp, .vtu), as written by ParaView, 3D Slicer and PyVista.
 
-Numbers may be text, base64, or raw bytes behind everything else, each of them in blocks that zlib or lzma compressed. No
-more is unpacked than what the points and faces that the file announces can need.
+Arrays may be text, base64, or raw bytes at the end of the file; binary ones may be in blocks compressed by zlib or lzma. No
+more data is decompressed than the size of the file can plausibly need.
 """
 
 from __future__ import annotations
@@ -51,25 +51,25 @@ APPENDED = re.compile(rb"<AppendedData\b([^>]{0,200})>\s*_")
 
 
 def read(path: Path, data: bytes) -> Raw:
-    """The points of all pieces and their faces; colors where a piece has three or four bytes a point."""
+    """Read the points and faces of all pieces, and colors where a piece has a point array of three or four bytes."""
     return _File(path.name, data).raw()
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The points of a PolyData of one piece, and how many corners its polygons have; None where it has other cells."""
+    """Points of a PolyData with one piece, and corner counts of its polygons; None if it has other cells, or no polygons."""
 
     verts: Float[Floats, "V 3"]
     sizes: Int[Ints, " P"] | None
 
 
 def surface_of(name: str, data: bytes) -> Surface | None:
-    """Points and polygons of a file; None if it has several pieces, or is no PolyData."""
+    """Read the points and polygon sizes of a file; None if it has several pieces, or is not PolyData."""
     file = _File(name, data)
     pieces = file.root.findall("./*/Piece")
     if len(pieces) != 1 or file.root.get("type") != "PolyData":
         return None
-    file._may_unpack()
+    file._reset_budget()
     points = file.named(pieces[0], "Points", None)
     if points is None or points.size % 3:
         return None
@@ -81,36 +81,43 @@ def surface_of(name: str, data: bytes) -> Surface | None:
 
 
 def element_like(head: bytes, name: str, values: NDArray[Any]) -> str:
-    """An array (V, D) as an element for a file that begins so: in its order of bytes, and compressed as it is."""
+    """Format an array (V, D) as an XML element, with the byte order and compressor that the file header `head` declares."""
     begin = re.search(rb"<VTKFile\b[^>]*>", head)
-    said = {} if begin is None else ElementTree.fromstring(begin[0].rstrip(b"/>") + b"/>").attrib
-    order = ">" if said.get("byte_order") == "BigEndian" else "<"
-    header = np.dtype(order + ("u8" if said.get("header_type") == "UInt64" else "u4"))
+    attributes = {} if begin is None else ElementTree.fromstring(begin[0].rstrip(b"/>") + b"/>").attrib
+    byte_order = ">" if attributes.get("byte_order") == "BigEndian" else "<"
+    header = np.dtype(byte_order + ("u8" if attributes.get("header_type") == "UInt64" else "u4"))
     code = values.dtype.str[1:]
-    raw = values.astype(np.dtype(order + code)).tobytes()
+    raw = values.astype(np.dtype(byte_order + code)).tobytes()
     kind = next(word for word, each in TYPES.items() if each == code)
-    opened = f'<DataArray type="{kind}" Name="{html.escape(name)}" NumberOfComponents="{values.shape[1]}" format='
-    pack = _PACK.get(said.get("compressor", ""))
+    start_tag = f'<DataArray type="{kind}" Name="{html.escape(name)}" NumberOfComponents="{values.shape[1]}" format='
+    pack = _PACK.get(attributes.get("compressor", ""))
     if pack is None:
-        return f'{opened}"ascii">{" ".join(values.astype(str).ravel().tolist())}</DataArray>\n'
+        return f'{start_tag}"ascii">{" ".join(values.astype(str).ravel().tolist())}</DataArray>\n'
     packed = pack(raw)
     sizes = [len(raw)] if packed is raw else [1, len(raw), 0, len(packed)]
-    text = np.array(sizes, header).tobytes()
-    letters = base64.b64encode(text + raw) if packed is raw else base64.b64encode(text) + base64.b64encode(packed)
-    return f'{opened}"binary">{letters.decode()}</DataArray>\n'
+    encoded_header = np.array(sizes, header).tobytes()
+    encoded = (
+        base64.b64encode(encoded_header + raw)
+        if packed is raw
+        else base64.b64encode(encoded_header) + base64.b64encode(packed)
+    )
+    return f'{start_tag}"binary">{encoded.decode()}</DataArray>\n'
 
 
 def arrays_of(name: str, data: bytes) -> list[str]:
-    """The names of arrays of points and cells that are no colors or normals."""
+    """Names of the point and cell arrays of a file, without colors and normals."""
     root = _File(name, data).root
     found = [each for group in ("PointData", "CellData") for each in root.findall(f"./*/Piece/{group}/DataArray")]
-    kept = [each for each in found if each.get("type") != "UInt8" or each.get("NumberOfComponents") not in ("3", "4")]
-    return [label for label in dict.fromkeys(str(each.get("Name")) for each in kept) if label != "Normals"]
+    not_colors = [
+        each for each in found if each.get("type") != "UInt8" or each.get("NumberOfComponents") not in ("3", "4")
+    ]
+    return [label for label in dict.fromkeys(str(each.get("Name")) for each in not_colors) if label != "Normals"]
 
 
 def point_arrays(path: Path | None) -> dict[str, NDArray[Any]]:
-    """Numbers (V,) or (V, D) of the points of a file by name, of several pieces those that all have; but no colors. None of
-    a file of another format.
+    """Read the point arrays of a file, (V,) or (V, D), by name; without colors.
+
+    Of several pieces, only arrays that all of them have are read. Empty for files of other formats.
     """
     if path is None or path.suffix.lower() not in SUFFIXES:
         return {}
@@ -118,6 +125,8 @@ def point_arrays(path: Path | None) -> dict[str, NDArray[Any]]:
 
 
 class _File:
+    """A parsed XML file; arrays are decoded on demand."""
+
     def __init__(self, name: str, data: bytes) -> None:
         self.name, self.size, self.appended, self.encoding = name, len(data), b"", b""
         begin = data.find(b"<AppendedData")
@@ -140,7 +149,7 @@ class _File:
         self.order = ">" if self.root.get("byte_order") == "BigEndian" else "<"
         self.header = np.dtype(self.order + ("u8" if self.root.get("header_type") == "UInt64" else "u4"))
         self.compressor = str(self.root.get("compressor") or "")
-        self._may_unpack()
+        self._reset_budget()
 
     def raw(self) -> Raw:
         pieces = self.root.findall("./*/Piece")
@@ -159,8 +168,8 @@ class _File:
             colors.append(self._colors(piece, count))
             cells += [each.moved(first, count) for each in self._cells(piece)]
             first += count
-        painted_ = joined_colors(colors, counts) if pieces else None
-        return raw_of(self.name, self.size, np.concatenate(verts), cells, painted_)
+        vertex_colors = joined_colors(colors, counts) if pieces else None
+        return raw_of(self.name, self.size, np.concatenate(verts), cells, vertex_colors)
 
     def point_arrays(self) -> dict[str, NDArray[Any]]:
         parts = [self._of_points(piece) for piece in self.root.findall("./*/Piece")]
@@ -174,31 +183,31 @@ class _File:
             components = element.get("NumberOfComponents", "1")
             width = int(components) if re.fullmatch("[1-9][0-9]{0,3}", components) else 1
             if element.get("type") in TYPES and not (element.get("type") == "UInt8" and width in (3, 4)):
-                self._may_unpack()
+                self._reset_budget()
                 values = self._array(element)
                 if values.size == count * width:
                     found[element.get("Name", "value")] = values.reshape(count, width) if width > 1 else values
         return found
 
-    def _may_unpack(self) -> None:
-        """So many bytes from now on."""
-        self.left = 64 * (BASE_ELEMENTS + self.size // 12)
+    def _reset_budget(self) -> None:
+        """Reset the number of bytes that may be decompressed from now on."""
+        self.budget = 64 * (BASE_ELEMENTS + self.size // 12)
 
     def _cells(self, piece: ElementTree.Element) -> list[Cells]:
         found = []
         for group, kind in (("Polys", 7), ("Strips", 6), ("Cells", None)):
-            many = _count(self.name, piece, f"NumberOf{group}")
-            if not many:
+            n_cells = _count(self.name, piece, f"NumberOf{group}")
+            if not n_cells:
                 continue
             corners = self.named(piece, group, "connectivity")
             ends = self.named(piece, group, "offsets")
-            if corners is None or ends is None or len(ends) != many:
-                raise damaged(self.name, f"a piece has other than the {many} cells that it promises")
+            if corners is None or ends is None or len(ends) != n_cells:
+                raise damaged(self.name, f"a piece has other than the {n_cells} cells that it promises")
             kinds = self.named(piece, group, "types") if kind is None else np.full(len(ends), kind)
             if kinds is None or len(kinds) != len(ends):
                 raise damaged(self.name, "it does not say of what kind its cells are")
             sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
-            self.triangles += max(int(sizes.sum()) - 2 * many, 0)
+            self.triangles += max(int(sizes.sum()) - 2 * n_cells, 0)
             check_element_count(self.name, self.size, self.points, self.triangles)
             corners = corners[: max(int(sizes.sum()), 0)]
             found.append(Cells(corners.astype(np.int64), sizes, kinds.astype(np.int64)))
@@ -214,14 +223,16 @@ class _File:
         return None
 
     def named(self, piece: ElementTree.Element, group: str, name: str | None) -> NDArray[Any] | None:
+        """Read the array with a name (the first one for None) from a group of a piece; None if there is none."""
         for element in piece.findall(f"./{group}/DataArray"):
             if name is None or element.get("Name") == name:
                 return self._array(element)
         return None
 
     def _array(self, element: ElementTree.Element) -> NDArray[Any]:
-        kind = TYPES.get(str(element.get("type")))
-        if kind is None:
+        """Decode a DataArray element."""
+        type_code = TYPES.get(str(element.get("type")))
+        if type_code is None:
             raise damaged(self.name, f"numbers of the unknown type {str(element.get('type'))[:40]}")
         form, text = element.get("format", "ascii"), (element.text or "").strip().encode()
         if form == "ascii":
@@ -234,81 +245,85 @@ class _File:
                 data = self._raw(at) if b"raw" in self.encoding else self._base64(memoryview(self.appended)[at:])
             else:
                 data = self._base64(text)
-            return np.frombuffer(data, np.dtype(self.order + kind))
+            return np.frombuffer(data, np.dtype(self.order + type_code))
         except (ValueError, IndexError, OverflowError, binascii.Error, zlib.error, lzma.LZMAError, EOFError) as error:
             raise damaged(self.name, f"numbers cannot be read ({error})") from None
 
     def _raw(self, at: int) -> bytes:
-        """The data behind a header of bytes."""
+        """Decode an appended raw array, with its header, at an offset."""
         width = self.header.itemsize
-        first = self._head(self.appended[at : at + width], 1)
+        first = self._read_header(self.appended[at : at + width], 1)
         if not self.compressor:
-            count = self._limited(int(first[0]))
-            return self._checked(self.appended[at + width : at + width + count], count)
-        head = self._head(self.appended[at : at + self._head_size(int(first[0]))], 3 + int(first[0]))
+            count = self._spend(int(first[0]))
+            return self._check_length(self.appended[at + width : at + width + count], count)
+        head = self._read_header(self.appended[at : at + self._header_size(int(first[0]))], 3 + int(first[0]))
         at += len(head) * width
-        return self._unpacked(head, self.appended[at : at + int(head[3:].sum())])
+        return self._decompress(head, self.appended[at : at + int(head[3:].sum())])
 
     def _base64(self, text: bytes | memoryview) -> bytes:
-        """The data behind a header of base64, which may be a text of its own."""
+        """Decode a base64 array with its header, which may be encoded separately."""
         width = self.header.itemsize
-        first = base64.b64decode(text[: _letters(width)])
-        count = int(self._head(first[:width], 1)[0])
+        first = base64.b64decode(text[: _base64_length(width)])
+        count = int(self._read_header(first[:width], 1)[0])
         if not self.compressor:
-            if len(first) == width:  # padded: the header stands by itself
-                begin, skip = _letters(width), 0
+            if len(first) == width:  # padded: the header is encoded separately
+                begin, skip = _base64_length(width), 0
             else:
                 begin, skip = 0, width
-            letters = text[begin : begin + _letters(skip + self._limited(count))]
-            return self._checked(base64.b64decode(letters)[skip:][:count], count)
-        size = self._head_size(count)
-        head = self._head(base64.b64decode(text[: _letters(size)])[:size], 3 + count)
-        begin = _letters(size)
-        return self._unpacked(head, base64.b64decode(text[begin : begin + _letters(int(head[3:].sum()))]))
+            letters = text[begin : begin + _base64_length(skip + self._spend(count))]
+            return self._check_length(base64.b64decode(letters)[skip:][:count], count)
+        size = self._header_size(count)
+        head = self._read_header(base64.b64decode(text[: _base64_length(size)])[:size], 3 + count)
+        begin = _base64_length(size)
+        return self._decompress(head, base64.b64decode(text[begin : begin + _base64_length(int(head[3:].sum()))]))
 
-    def _head_size(self, blocks: int) -> int:
+    def _header_size(self, blocks: int) -> int:
         if blocks > self.size:
             raise ValueError("more blocks than bytes")
         return (3 + blocks) * self.header.itemsize
 
-    def _head(self, data: bytes, count: int) -> Ints:
+    def _read_header(self, data: bytes, count: int) -> Ints:
         found = np.frombuffer(data, self.header, count).astype(np.int64)
         if (found < 0).any():
             raise ValueError("a length below 0")
         return found
 
-    def _limited(self, count: int) -> int:
-        """A number of bytes, taken from those that may still be unpacked."""
-        self.left -= count
-        if self.left < 0:
+    def _spend(self, count: int) -> int:
+        """Return `count` after subtracting it from the bytes that may be decompressed; `ValueError` if it exceeds them."""
+        self.budget -= count
+        if self.budget < 0:
             raise ValueError("more than points and faces can need")
         return count
 
-    def _checked(self, data: bytes, count: int) -> bytes:
+    def _check_length(self, data: bytes, count: int) -> bytes:
         if len(data) < count:
             raise ValueError("they end too early")
         return data
 
-    def _unpacked(self, head: Ints, data: bytes) -> bytes:
-        blocks, size, last = (int(each) for each in head[:3])
+    def _decompress(self, header_values: Ints, data: bytes) -> bytes:
+        """Decompress blocks.
+
+        `header_values` has their number, their size, the size of the last one (0 if it is full), and their compressed sizes.
+        """
+        blocks, size, last = (int(each) for each in header_values[:3])
         sizes = np.full(blocks, size)
         if blocks and last:
             sizes[-1] = last
-        self._limited(int(sizes.sum()))
+        self._spend(int(sizes.sum()))
         if self.compressor not in _UNPACK:
             raise InputError(
                 f"{self.name} is compressed by {self.compressor[:40]}", "save it with zlib, or uncompressed"
             )
         out, at = [], 0
-        for packed, length in zip(head[3:].tolist(), sizes.tolist(), strict=True):
+        for packed, length in zip(header_values[3:].tolist(), sizes.tolist(), strict=True):
             block = _UNPACK[self.compressor]().decompress(data[at : at + packed], length)
-            out.append(self._checked(block, length))
+            out.append(self._check_length(block, length))
             at += packed
         return b"".join(out)
 
 
-def _letters(count: int) -> int:
-    """How many letters of base64 so many bytes take."""
+def _base64_length(count: int) -> int:
+    """Length in base64 of a number of bytes."""
     return 4 * -(-count // 3)
 
 

@@ -1,4 +1,4 @@
-"""A .vtp file with further arrays: everything else in it stays, byte for byte."""
+"""Add arrays to a .vtp file; everything else in it is kept, byte for byte."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import warn
-from meshmatch.shapes.formats.polygons import of_most_triangles
-from meshmatch.shapes.formats.vtk import Arrays, comment_of, plain
+from meshmatch.shapes.formats.polygons import majority_of_triangles
+from meshmatch.shapes.formats.vtk import Arrays, to_vtk_types, xml_comment
 from meshmatch.shapes.formats.vtk_xml import APPENDED, Surface, arrays_of, element_like, surface_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 _GROUPS = (b"PointData", b"CellData")
-_NAMED = re.compile(rb"<!-- label -?\d+(?: .*?)?-->\s*", re.DOTALL)
-# What XML consists of, besides text: comments and the like, and tags with their attributes.
+_LABEL_COMMENT = re.compile(rb"<!-- label -?\d+(?: .*?)?-->\s*", re.DOTALL)
+# XML tokens other than text: comments, CDATA sections, processing instructions, and tags with their attributes.
 _TOKEN = re.compile(
     rb"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>"
     rb"|<(?P<ends>/?)(?P<tag>[\w:.-]+)(?P<attributes>(?:\s+[\w:.-]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*)\s*(?P<empty>/?)>",
@@ -32,13 +32,16 @@ _NAME = re.compile(rb"\sName\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 
 @dataclass(frozen=True, eq=False)
 class VtpFile:
-    """A .vtp to be written with further arrays.
+    """A .vtp file that can be rewritten with further arrays.
 
     Attributes
     ----------
-    name : of the file, for words
-    data : its bytes
-    surface : points and polygons; None where it has several pieces
+    name
+        Name of the file, for messages.
+    data
+        Its bytes.
+    surface
+        Its points and polygons; None if it has several pieces.
     """
 
     name: str
@@ -47,66 +50,79 @@ class VtpFile:
 
     @classmethod
     def parsed(cls, name: str, data: bytes) -> VtpFile:
-        """From its bytes."""
+        """Parse the bytes of a file."""
         return cls(name, data, surface_of(name, data))
 
     @classmethod
     def of(cls, file: Path | None, shape: Shape, faces: bool = False) -> VtpFile | None:
-        """The file that a shape was read from; None where it came from elsewhere, is another one by now, or is in pieces,
-        and where ``faces`` need rows of their own and the file has other cells than polygons.
+        """Return the file that a shape was read from, or None if it cannot be edited for the shape.
+
+        That is, if it is not a vtp file of one piece; if its vertices are no longer those of the shape; or if ``faces`` are
+        to get arrays, but the file has other cells than polygons, or another number of triangles.
         """
         if file is None or file.suffix.lower() != ".vtp" or not file.is_file():
             return None
-        found = cls.parsed(file.name, read_bytes(file))
-        surface = found.surface
+        candidate = cls.parsed(file.name, read_bytes(file))
+        surface = candidate.surface
         if surface is None or not np.array_equal(surface.verts, shape.verts_or_nan, equal_nan=True):
             return None
         if faces and (surface.sizes is None or int(np.maximum(surface.sizes - 2, 0).sum()) != shape.F):
             return None
-        return found
+        return candidate
 
     @property
     def arrays(self) -> list[str]:
-        """The names of arrays of points and cells that are no colors or normals."""
+        """Names of its point and cell arrays, without colors and normals."""
         return arrays_of(self.name, self.data)
 
     @property
     def beyond_triangles(self) -> list[str]:
-        """What the file has besides triangles and their colors, in words."""
+        """Kinds of content besides triangles and their colors, in words."""
         sizes = None if self.surface is None else self.surface.sizes
         polygons = sizes is not None and bool((sizes > 3).any())
         return ["polygons"] * polygons + [f"array {each}" for each in self.arrays]
 
     def with_arrays(self, of_points: Arrays, of_faces: Arrays, comments: Iterable[str] = ()) -> bytes:
-        """Its bytes with further arrays; what has the name of one is replaced, which is said but of colors.
+        """Return its bytes with further arrays.
+
+        Existing arrays of the same name are replaced, with a warning unless they are colors.
 
         Parameters
         ----------
         of_points
             Arrays (V,) or (V, D) by name.
         of_faces
-            Arrays (F,) or (F, D) for its triangles as `vtk_xml.read` makes them: a polygon has what most of its triangles
-            have, by the first of the arrays.
+            Arrays (F,) or (F, D) for the triangles of `vtk_xml.read`; polygons get the values of `majority_of_triangles`.
         comments
-            Go in front of everything but the XML declaration, where those on labels make room for them.
+            Comments before the root element. If an array is called "label", they replace earlier comments on labels.
         """
         if of_faces and self.surface is not None and self.surface.sizes is not None:
-            of_faces = of_most_triangles(of_faces, self.surface.sizes)
+            of_faces = majority_of_triangles(of_faces, self.surface.sizes)
         begin = APPENDED.search(self.data)
         head, rest = (self.data, b"") if begin is None else (self.data[: begin.start()], self.data[begin.start() :])
         for group, arrays in zip(_GROUPS, (of_points, of_faces), strict=True):
             if arrays:
-                head = _with(self.name, head, group, dict(plain(arrays)))
-        at = _Places.of(head).root
-        before = _NAMED.sub(b"", head[:at]) if "label" in {*of_points, *of_faces} else head[:at]
-        told = "".join(f"{comment_of(each)}\n" for each in comments).encode("ascii", "xmlcharrefreplace")
-        return before + told + head[at:] + rest
+                head = _add_arrays(self.name, head, group, dict(to_vtk_types(arrays)))
+        at = _Offsets.of(head).root
+        prolog = _LABEL_COMMENT.sub(b"", head[:at]) if "label" in {*of_points, *of_faces} else head[:at]
+        new_comments = "".join(f"{xml_comment(each)}\n" for each in comments).encode("ascii", "xmlcharrefreplace")
+        return prolog + new_comments + head[at:] + rest
 
 
 @dataclass
-class _Places:
-    """Where the first piece has its data: of the root and behind the tag of the piece; of each group where its tag begins
-    and ends, where the tag that closes it begins, and its arrays with their names.
+class _Offsets:
+    """Byte offsets in a file, for adding arrays to its first piece.
+
+    Attributes
+    ----------
+    root
+        Start of the root element.
+    piece
+        End of the start tag of the first piece.
+    groups
+        Start and end of the start tag of each group, and start of its end tag.
+    arrays
+        Start, end and name of each array, by group.
     """
 
     root: int = -1
@@ -115,51 +131,54 @@ class _Places:
     arrays: dict[bytes, list[tuple[int, int, str]]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, head: bytes) -> _Places:
-        found, open_ = cls(), list[tuple[bytes, int, int, str]]()
+    def of(cls, head: bytes) -> _Offsets:
+        offsets, open_ = cls(), list[tuple[bytes, int, int, str]]()
         for token in _TOKEN.finditer(head):
             tag = token["tag"]
             if tag is None:
                 continue
             if not token["ends"]:
                 name = _NAME.search(token["attributes"])
-                said = "" if name is None else html.unescape((name[1] or name[2] or b"").decode("utf-8", "replace"))
-                open_.append((tag, token.start(), token.end(), said))
-                if len(open_) == 1 and found.root < 0:
-                    found.root = token.start()
+                array_name = (
+                    "" if name is None else html.unescape((name[1] or name[2] or b"").decode("utf-8", "replace"))
+                )
+                open_.append((tag, token.start(), token.end(), array_name))
+                if len(open_) == 1 and offsets.root < 0:
+                    offsets.root = token.start()
                 if len(open_) == 3 and tag == b"Piece":
-                    found.piece = token.end()
+                    offsets.piece = token.end()
             if token["ends"] or token["empty"]:
                 if not open_:
                     break
-                own, begin, behind, said = open_.pop()
-                if len(open_) == 3 and own in _GROUPS and own not in found.groups:
-                    found.groups[own] = begin, behind, behind if token["empty"] else token.start()
-                if len(open_) == 4 and open_[-1][0] in _GROUPS and own == b"DataArray":
-                    found.arrays.setdefault(open_[-1][0], []).append((begin, token.end(), said))
-        return found
+                closed, begin, tag_end, array_name = open_.pop()
+                if len(open_) == 3 and closed in _GROUPS and closed not in offsets.groups:
+                    offsets.groups[closed] = begin, tag_end, tag_end if token["empty"] else token.start()
+                if len(open_) == 4 and open_[-1][0] in _GROUPS and closed == b"DataArray":
+                    offsets.arrays.setdefault(open_[-1][0], []).append((begin, token.end(), array_name))
+        return offsets
 
 
-def _with(name: str, head: bytes, group: bytes, arrays: dict[str, NDArray[Any]]) -> bytes:
-    places = _Places.of(head)
-    for begin, end, said in reversed(places.arrays.get(group, [])):
-        if said in arrays:
+def _add_arrays(name: str, head: bytes, group: bytes, arrays: dict[str, NDArray[Any]]) -> bytes:
+    """Add arrays to a group of the first piece, replacing those of the same name."""
+    offsets = _Offsets.of(head)
+    for begin, end, array_name in reversed(offsets.arrays.get(group, [])):
+        if array_name in arrays:
             head = head[:begin] + head[end:]
-            if arrays[said].dtype != np.uint8:
-                warn(f"{name} has an array {said} already, which is replaced")
-    places = _Places.of(head)
-    # the first colors are those that readers show
+            if arrays[array_name].dtype != np.uint8:
+                warn(f"{name} has an array {array_name} already, which is replaced")
+    offsets = _Offsets.of(head)
+    # readers show the first array of colors, so new colors come first
     colors, others = (
         "".join(element_like(head, label, each) for label, each in arrays.items() if (each.dtype == np.uint8) == first)
         for first in (True, False)
     )
     first, last = (each.encode("ascii", "xmlcharrefreplace") for each in (colors, others))
-    if group not in places.groups:
-        at = places.piece
+    if group not in offsets.groups:
+        at = offsets.piece
         return head[:at] + b"\n<%b>\n%b%b</%b>" % (group, first, last, group) + head[at:]
-    begin, behind, closing = places.groups[group]
-    if closing == behind and head[behind - 2 : behind] == b"/>":
-        opened = head[begin : behind - 2].rstrip() + b">"
-        return head[:begin] + opened + b"\n%b%b</%b>" % (first, last, group) + head[behind:]
-    inside = head[behind:closing].rstrip()
-    return head[:behind] + b"\n" * bool(first) + first.rstrip() + inside + b"\n" + last + head[closing:]
+    begin, tag_end, closing = offsets.groups[group]
+    if closing == tag_end and head[tag_end - 2 : tag_end] == b"/>":
+        opened = head[begin : tag_end - 2].rstrip() + b">"
+        return head[:begin] + opened + b"\n%b%b</%b>" % (first, last, group) + head[tag_end:]
+    inside = head[tag_end:closing].rstrip()
+    return head[:tag_end] + b"\n" * bool(first) + first.rstrip() + inside + b"\n" + last + head[closing:]
