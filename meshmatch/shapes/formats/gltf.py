@@ -122,8 +122,10 @@ class Document:
         self.buffers: dict[int, bytes] = {}
         self.world: dict[int, Floats] = {}
         self.hidden: set[int] = set()
-        self._bones: dict[int, Floats] = {}  # cached: a thousand meshes may share one skin of a thousand joints
-        self._mirrors: dict[int, bool] = {}
+        self._skinning_matrices: dict[
+            int, Floats
+        ] = {}  # cached: a thousand meshes may share one skin of a thousand joints
+        self._is_mirrored: dict[int, bool] = {}
         self._sparse_limit: int | None = None
         if compressed := {each for each in required if each in COMPRESSED}:
             self.buffers |= decompress(self.name, self.size, self.json, self.buffer, compressed)
@@ -152,14 +154,14 @@ class Document:
         meshes: list[tuple[tuple[str, ...], int]] = []
         n_elements = n_verts = 0
         # A scene may instance one mesh a thousand times, so that a small file can declare any number of vertices.
-        for node, primitive, place in self.primitives():
+        for node, primitive, matrix in self.primitives():
             vertices = self.count(primitive["attributes"]["POSITION"])
             corners = self.count(primitive["indices"]) if "indices" in primitive else vertices
             thirds = 1 if primitive.get("mode", _TRIANGLES) in (_STRIP, _FAN) else 3
             n_elements += vertices + (corners // thirds if primitive.get("mode", _TRIANGLES) != _POINTS else 0)
             check_element_count(self.name, self.size, n_elements)
-            positions = self.placed(node, primitive, place)
-            triangles = self.drawn_triangles(node, primitive, place)
+            positions = self.scene_positions(node, primitive, matrix)
+            triangles = self.drawn_triangles(node, primitive, matrix)
             if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
                 raise damaged(self.name, f"a face refers to vertex {int(triangles.max())} of {len(positions)}")
             faces.append(triangles + n_verts)
@@ -178,18 +180,18 @@ class Document:
             painted[:, :3] = to_srgb(painted[:, :3])
         is_skinned = np.concatenate(skinned)
         triangles = np.vstack(faces)
-        skin, made_of = is_skinned if is_skinned.any() else None, self.origins(triangles)
+        skin, made_of = is_skinned if is_skinned.any() else None, self.source_hashes(triangles)
         return Raw(np.vstack(verts), triangles, painted, skin, tuple(meshes), made_of)
 
     def faces(self) -> Int[Ints, "F 3"]:
         """Read only the triangles of `scene`."""
         found, n_verts = [NO_FACES], 0
-        for node, primitive, place in self.primitives():
-            found.append(self.drawn_triangles(node, primitive, place) + n_verts)
+        for node, primitive, matrix in self.primitives():
+            found.append(self.drawn_triangles(node, primitive, matrix) + n_verts)
             n_verts += self.count(primitive["attributes"]["POSITION"])
         return np.vstack(found)
 
-    def origins(self, faces: Int[Ints, "F 3"]) -> tuple[str, ...]:
+    def source_hashes(self, faces: Int[Ints, "F 3"]) -> tuple[str, ...]:
         """Hashes of the meshes that this file records as its vertex-by-vertex sources.
 
         Empty if there are none, or if the faces have changed since the record was written.
@@ -220,26 +222,26 @@ class Document:
         for node in self._walk():
             if "mesh" not in self.nodes[node] or node in self.hidden:
                 continue
-            for place in self._places(node):
+            for matrix in self._instance_matrices(node):
                 n_drawn += 1
                 self._check_node_count(n_drawn)
                 for primitive in self.json["meshes"][self.nodes[node]["mesh"]]["primitives"]:
                     n_drawn += 1
                     self._check_node_count(n_drawn)
-                    drawn = primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN)
-                    if drawn and "POSITION" in primitive.get("attributes", {}):  # without positions nothing is drawn
-                        yield node, primitive, place
+                    is_drawn = primitive.get("mode", _TRIANGLES) in (_POINTS, _TRIANGLES, _STRIP, _FAN)
+                    if is_drawn and "POSITION" in primitive.get("attributes", {}):  # without positions nothing is drawn
+                        yield node, primitive, matrix
 
-    def _places(self, number: int) -> Iterator[Float[Floats, "4 4"]]:
+    def _instance_matrices(self, number: int) -> Iterator[Float[Floats, "4 4"]]:
         """Yield the (4, 4) matrices to the scene of a node's mesh: one, or one per GPU instance."""
         world = self.world[number]
-        given = self.nodes[number].get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
-        keys = [key for key in ("TRANSLATION", "ROTATION", "SCALE") if key in given]
+        attributes = self.nodes[number].get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
+        keys = [key for key in ("TRANSLATION", "ROTATION", "SCALE") if key in attributes]
         if not keys:
             yield world
             return
-        self._check_node_count(max(self.count(given[key]) for key in keys))
-        for rows in zip(*(self.accessor(given[key]) for key in keys), strict=True):
+        self._check_node_count(max(self.count(attributes[key]) for key in keys))
+        for rows in zip(*(self.accessor(attributes[key]) for key in keys), strict=True):
             yield world @ local_matrix({key.lower(): row for key, row in zip(keys, rows, strict=True)})
 
     def _check_node_count(self, number: int) -> None:
@@ -287,45 +289,45 @@ class Document:
             stack += [(child, self.world[node]) for child in reversed(self.nodes[node].get("children", []))]
         return list(self.world)
 
-    def placed(self, number: int, primitive: dict[str, Any], place: Floats) -> Floats:
-        """(V, 3) positions of a primitive's vertices in scene coordinates; `place` is the matrix of its node or instance."""
+    def scene_positions(self, number: int, primitive: dict[str, Any], matrix: Floats) -> Floats:
+        """(V, 3) positions of a primitive's vertices in scene coordinates; `matrix` is that of its node or instance."""
         for extension in primitive.get("extensions", {}):  # uncompressed data may be present as well
             if not _HARMLESS.fullmatch(extension) and not self._has_data(primitive["attributes"]["POSITION"]):
                 raise self._compressed(extension)
         positions = self.accessor(primitive["attributes"]["POSITION"])
-        return self.moved(number, primitive, np.hstack([positions, np.ones((len(positions), 1))]), place)
+        return self.to_scene(number, primitive, np.hstack([positions, np.ones((len(positions), 1))]), matrix)
 
-    def moved(
-        self, number: int, primitive: dict[str, Any], own: Float[Floats, "V 4"], place: Float[Floats, "4 4"]
+    def to_scene(
+        self, number: int, primitive: dict[str, Any], vectors: Float[Floats, "V 4"], matrix: Float[Floats, "4 4"]
     ) -> Float[Floats, "V 3"]:
         """Transform per-vertex vectors of a primitive to scene coordinates.
 
-        `own` are homogeneous vectors: positions (fourth component 1) or directions (0). They are moved by the skin of the
-        node (linear blend skinning), or by `place` where there is no skin or the weights are all 0.
+        `vectors` are homogeneous: positions (fourth component 1) or directions (0). They are moved by the skin of the
+        node (linear blend skinning), or by `matrix` where there is no skin or the weights are all 0.
         """
         node = self.nodes[number]
-        unskinned = np.asarray(own @ place.T)[:, :3]
+        unskinned = np.asarray(vectors @ matrix.T)[:, :3]
         if "skin" not in node or "JOINTS_0" not in primitive["attributes"]:
             return unskinned
-        bones = self.bones(node["skin"])
-        moved, total = np.zeros((len(own), 4)), np.zeros((len(own), 1))
+        matrices = self.skinning_matrices(node["skin"])
+        blended, total = np.zeros((len(vectors), 4)), np.zeros((len(vectors), 1))
         for joints, weights in self.influences(primitive):
             for column in range(4):
                 weight = weights[:, column : column + 1]
-                moved += weight * np.einsum("vij,vj->vi", bones[joints[:, column].astype(np.int64)], own)
+                blended += weight * np.einsum("vij,vj->vi", matrices[joints[:, column].astype(np.int64)], vectors)
                 total += weight
-        return np.where(total > 0, moved[:, :3] / np.where(total > 0, total, 1.0), unskinned)
+        return np.where(total > 0, blended[:, :3] / np.where(total > 0, total, 1.0), unskinned)
 
-    def bones(self, number: int) -> Floats:
+    def skinning_matrices(self, number: int) -> Floats:
         """(J, 4, 4) skinning matrices of a skin: joint world matrix times inverse bind matrix."""
-        if number not in self._bones:
+        if number not in self._skinning_matrices:
             skin = self.json["skins"][number]
-            bones = np.stack([self.world[joint] for joint in skin["joints"]])
+            matrices = np.stack([self.world[joint] for joint in skin["joints"]])
             if "inverseBindMatrices" in skin:
                 inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-                bones = bones @ inverse[: len(bones)]
-            self._bones[number] = bones
-        return self._bones[number]
+                matrices = matrices @ inverse[: len(matrices)]
+            self._skinning_matrices[number] = matrices
+        return self._skinning_matrices[number]
 
     def influences(self, primitive: dict[str, Any]) -> Iterator[tuple[Float[Floats, "V 4"], Float[Floats, "V 4"]]]:
         """Yield joint numbers (indices into the skin's joints) and their weights per vertex, four at a time."""
@@ -336,19 +338,19 @@ class Document:
             numbers = self.accessor(attributes[f"JOINTS_{k}"], whole=True)
             yield numbers, self.accessor(attributes[f"WEIGHTS_{k}"])
 
-    def mirrors(self, number: int, primitive: dict[str, Any], place: Floats) -> bool:
+    def is_mirrored(self, number: int, primitive: dict[str, Any], matrix: Floats) -> bool:
         """Whether the node, or most joints of its skin, mirrors a primitive, which flips its triangles (section 3.7.4)."""
         skin = self.nodes[number].get("skin")
         if skin is None or "JOINTS_0" not in primitive["attributes"]:
-            return bool(np.linalg.det(place[:3, :3]) < 0)
-        if skin not in self._mirrors:
-            self._mirrors[skin] = bool((np.linalg.det(self.bones(skin)[:, :3, :3]) < 0).mean() > 0.5)
-        return self._mirrors[skin]
+            return bool(np.linalg.det(matrix[:3, :3]) < 0)
+        if skin not in self._is_mirrored:
+            self._is_mirrored[skin] = bool((np.linalg.det(self.skinning_matrices(skin)[:, :3, :3]) < 0).mean() > 0.5)
+        return self._is_mirrored[skin]
 
-    def drawn_triangles(self, number: int, primitive: dict[str, Any], place: Floats) -> Int[Ints, "F 3"]:
+    def drawn_triangles(self, number: int, primitive: dict[str, Any], matrix: Floats) -> Int[Ints, "F 3"]:
         """Triangles of a primitive, counterclockwise seen from outside in scene coordinates."""
         found = self.triangles(primitive)
-        return found[:, ::-1] if self.mirrors(number, primitive, place) else found
+        return found[:, ::-1] if self.is_mirrored(number, primitive, matrix) else found
 
     def triangles(self, primitive: dict[str, Any]) -> Int[Ints, "F 3"]:
         """Triangles of a primitive, oriented as in the file."""

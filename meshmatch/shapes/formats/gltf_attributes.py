@@ -49,9 +49,9 @@ def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
 
 def _coordinates(document: Document) -> Floats | None:
     parts = [np.empty((0, 3, 2))]
-    for node, primitive, place in document.primitives():
+    for node, primitive, matrix in document.primitives():
         attributes = primitive["attributes"]
-        faces = document.drawn_triangles(node, primitive, place)
+        faces = document.drawn_triangles(node, primitive, matrix)
         if len(faces) and "TEXCOORD_0" not in attributes:
             return None
         if len(faces):
@@ -107,10 +107,10 @@ class Look:
         colors: list[Floats | None] = []
         counts: list[int] = []
         numbers: dict[tuple[int, bool], int] = {}
-        for node, primitive, place in self.document.primitives():
+        for node, primitive, matrix in self.document.primitives():
             counts.append(self.document.count(primitive["attributes"]["POSITION"]))
             colors.append(self.document.colors(primitive))
-            faces = self.document.drawn_triangles(node, primitive, place)
+            faces = self.document.drawn_triangles(node, primitive, matrix)
             uv = self._coordinates(primitive) if len(faces) else None
             key = primitive.get("material", -1), uv is not None
             if key not in self.materials:
@@ -164,7 +164,7 @@ class Look:
         return self.images[number]
 
     def _coordinates(self, primitive: dict[str, Any]) -> Floats | None:
-        """(V, 2) texture coordinates of a primitive's vertices; None if it has none, or no texture."""
+        """(V, 2) coordinates of a primitive's vertices for the texture of the layer; None without coordinates or texture."""
         _, texture, _ = self.base(primitive.get("material", -1))
         if texture is None and self.picture is None:
             return None

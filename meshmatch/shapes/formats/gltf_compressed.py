@@ -134,8 +134,8 @@ def _jobs(
     for primitive in primitives:
         draco = primitive["extensions"][DRACO]
         sizes = {what: _n_scalars(each) for what, each in _accessors(description, primitive)}
-        place = piece(description["bufferViews"][draco["bufferView"]])
-        jobs.append({"data": place, "ids": draco["attributes"], "sizes": sizes})
+        piece_number = piece(description["bufferViews"][draco["bufferView"]])
+        jobs.append({"data": piece_number, "ids": draco["attributes"], "sizes": sizes})
         declared += [4 * each for each in sizes.values()]
         vertices += sizes.get("POSITION", 0) // 3
         corners += sizes.get("indices", 0)
@@ -156,10 +156,10 @@ class _Buffer:
 
     def append(self, values: bytes) -> dict[str, int]:
         """Append values, padded to four bytes; return the buffer view entries for them."""
-        place = {"buffer": self.number, "byteOffset": self.size, "byteLength": len(values)}
+        view = {"buffer": self.number, "byteOffset": self.size, "byteLength": len(values)}
         self.chunks.append(values + b"\0" * (-len(values) % 4))
         self.size += len(self.chunks[-1])
-        return place
+        return view
 
 
 def _pop_fallback(buffer: dict[str, Any]) -> bool:

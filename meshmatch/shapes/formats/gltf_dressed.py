@@ -64,7 +64,7 @@ def dressed(
         for k, part in parts.items():
             faces = document.triangles(part)
             corners = uv[n_faces : n_faces + len(faces)]
-            if document.mirrors(number, part, document.world[number]):  # `uv` is in the corner order of the scene
+            if document.is_mirrored(number, part, document.world[number]):  # `uv` is in the corner order of the scene
                 corners = corners[:, ::-1]
             n_faces += len(faces)
             if not len(faces):
@@ -126,7 +126,7 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
 
 
 def _stored_uv(document: Document) -> Floats:
-    """All first texture coordinates of a scene, in file order and with their texture transforms applied."""
+    """First texture coordinates of everything that the scene draws, with texture transforms applied."""
     parts = [part for parts in drawn(document).values() for part in parts.values()]
     found = [base_color_uv(document, part) for part in parts if "TEXCOORD_0" in part["attributes"]]
     return np.concatenate([np.empty((0, 2)), *found])
@@ -247,6 +247,7 @@ class _MaterialReplacer:
             mapping["material"] = self._material_for(mapping["material"], moved_to)
 
     def _material_for(self, number: int | None, moved_to: int | None) -> int:
+        """Number of the baked version of a material (None: the default one); created at its first use."""
         key = number, moved_to
         if key not in self.made:
             if number is None:
@@ -310,12 +311,13 @@ class _MaterialReplacer:
     def list_extensions(self) -> None:
         """Add the extensions that the materials use to `extensionsUsed`."""
         used = {key for entry in self.editor.json["materials"] for key in entry.get("extensions", {})}
-        listed = self.editor.json.get("extensionsUsed", [])
-        if added := [key for key in (_GLOW, _UNLIT) if key in used and key not in listed]:
-            self.editor.json["extensionsUsed"] = [*listed, *added]
+        declared = self.editor.json.get("extensionsUsed", [])
+        if added := [key for key in (_GLOW, _UNLIT) if key in used and key not in declared]:
+            self.editor.json["extensionsUsed"] = [*declared, *added]
 
 
 def _materials_of(primitive: dict[str, Any]) -> Iterator[int]:
+    """Numbers of the materials of a primitive and of its variants."""
     if "material" in primitive:
         yield primitive["material"]
     for mapping in primitive.get("extensions", {}).get(_VARIANTS, {}).get("mappings", []):

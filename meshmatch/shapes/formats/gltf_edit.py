@@ -182,12 +182,12 @@ class Editor:
         spans = {(view.get("byteOffset", 0), view["byteLength"]) for view in views}
         if sum(length for _, length in spans) > self._size:  # views overlap
             return
-        whole = b"".join(self._chunks)
+        all_data = b"".join(self._chunks)
         self._chunks, self._size = [], 0
         places: dict[tuple[int, int], int] = {}
         for start, length in sorted(spans):
             shift = start % 4  # keeps the alignment of accessors
-            places[start, length] = self._append(bytes(shift) + whole[start : start + length]) + shift
+            places[start, length] = self._append(bytes(shift) + all_data[start : start + length]) + shift
         for view in views:
             view["byteOffset"] = places[view.get("byteOffset", 0), view["byteLength"]]
 
@@ -233,6 +233,6 @@ def drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
 
 def frames_of(document: Document, number: int, part: dict[str, Any]) -> Float[Floats, "V 3 3"]:
     """Linear maps, at each vertex of a primitive, that take directions to scene coordinates: by its skin or its node."""
-    V, place = document.count(part["attributes"]["POSITION"]), document.world[number]
-    axes = [document.moved(number, part, np.tile(axis, (V, 1)), place) for axis in np.eye(4)[:3]]
+    V, matrix = document.count(part["attributes"]["POSITION"]), document.world[number]
+    axes = [document.to_scene(number, part, np.tile(axis, (V, 1)), matrix) for axis in np.eye(4)[:3]]
     return np.stack(axes, axis=2)

@@ -57,8 +57,8 @@ def _finish(document: Document, reader: ImageReader) -> Finish | None:
         name for entry in entries for name in entry.get("extensions", {}) if name.startswith(_MATERIAL_PREFIX)
     }
     if unsupported := unsupported - {*_READ}:
-        named = ", ".join(sorted(name.removeprefix(_MATERIAL_PREFIX) for name in unsupported))
-        warn(f"the materials of {document.name} have what is not transferred: {named[:200]}")
+        extension_names = ", ".join(sorted(name.removeprefix(_MATERIAL_PREFIX) for name in unsupported))
+        warn(f"the materials of {document.name} have what is not transferred: {extension_names[:200]}")
     unlit = all(_UNLIT in entry.get("extensions", {}) for entry in entries)
     return Finish(layers, max(light, 1.0), any(entry.get("doubleSided", False) for entry in entries), unlit)
 

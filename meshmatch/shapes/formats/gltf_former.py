@@ -117,8 +117,8 @@ def _movers(document: Document, number: int, part: dict[str, Any]) -> Ints:
     if not sets:
         return np.full(V, -1)
     numbers, weights = (np.concatenate(each, axis=1) for each in zip(*sets, strict=True))
-    listed = np.array(document.json["skins"][document.nodes[number]["skin"]]["joints"], np.int64)
-    return np.asarray(listed[numbers[np.arange(V), weights.argmax(axis=1)].astype(np.int64)])
+    joint_numbers = np.array(document.json["skins"][document.nodes[number]["skin"]]["joints"], np.int64)
+    return np.asarray(joint_numbers[numbers[np.arange(V), weights.argmax(axis=1)].astype(np.int64)])
 
 
 def reattach_children(
@@ -164,10 +164,10 @@ def reattach_children(
             movers[mover] = int(binding.rig.joints[votes.argmax()])
         new = movers[mover]
         for child in attached:
-            place = np.linalg.inv(binding.bind[new]) @ document.world[child]
+            matrix = np.linalg.inv(binding.bind[new]) @ document.world[child]
             for key in ("translation", "rotation", "scale", "matrix"):
                 nodes[child].pop(key, None)
-            nodes[child]["matrix"] = place.T.ravel().tolist()
+            nodes[child]["matrix"] = matrix.T.ravel().tolist()
         remaining = set(nodes[joint]["children"]).difference(attached)
         nodes[joint]["children"] = [child for child in nodes[joint]["children"] if child in remaining]
         if not remaining:

@@ -83,7 +83,7 @@ def with_bones(document: Document, person: Person) -> bytes:
     list(document.primitives())
     editor = Editor(document)
     first = person.nodes + 1  # after the node named after the source's file
-    bones = {bone: first + place for bone, place in person.bones.items()}
+    bones = {bone: first + node_index for bone, node_index in person.bones.items()}
     worlds = dict(document.world)
     if nested(editor.json, "extensions", VRM0) is not None:
         worlds = _remove_rotations(editor, document, range(person.nodes, len(document.nodes)))
@@ -109,6 +109,7 @@ def _bones(document: Document) -> dict[str, int]:
 def _set_vrm0_bones(
     extension: Any, bones: Mapping[str, int], before: Mapping[int, Floats], now: Mapping[int, Floats]
 ) -> None:
+    """Set the humanoid bones of VRM 0.x, and move the first-person offset to the new head."""
     vrm0_names = {new: old for old, new in _VRM1_NAMES.items()}
     human_bones = [
         {"bone": vrm0_names.get(bone, bone), "node": node, "useDefaultValues": True} for bone, node in bones.items()
@@ -117,10 +118,10 @@ def _set_vrm0_bones(
     first_person = extension.get("firstPerson")
     if not isinstance(first_person, dict) or first_person.get("firstPersonBone", -1) not in before:
         return
-    given = first_person.get("firstPersonBoneOffset")
-    given = given if isinstance(given, dict) else {}
+    old_offset = first_person.get("firstPersonBoneOffset")
+    old_offset = old_offset if isinstance(old_offset, dict) else {}
     mirrored = np.array([1.0, 1.0, -1.0])  # vectors of VRM 0.x are left-handed
-    offset = mirrored * [given.get(axis, 0.0) for axis in "xyz"]
+    offset = mirrored * [old_offset.get(axis, 0.0) for axis in "xyz"]
     offset = mirrored * _change_frame(before[first_person["firstPersonBone"]], offset, now[bones["head"]])
     first_person["firstPersonBone"], first_person["firstPersonBoneOffset"] = (
         bones["head"],
@@ -131,6 +132,7 @@ def _set_vrm0_bones(
 def _set_vrm1_bones(
     extension: Any, bones: Mapping[str, int], former: Mapping[str, int], worlds: Mapping[int, Floats]
 ) -> None:
+    """Set the humanoid bones of VRM 1.0, and move the look-at offset to the new head."""
     extension.setdefault("humanoid", {})["humanBones"] = {bone: {"node": node} for bone, node in bones.items()}
     look_at = extension.get("lookAt")
     if isinstance(look_at, dict) and "offsetFromHeadBone" in look_at and former.get("head", -1) in worlds:
@@ -160,7 +162,7 @@ def _remove_rotations(editor: Editor, document: Document, nodes: range) -> dict[
         worlds[number][:3, 3] = position
     for skin, entry in enumerate(editor.json["skins"]):
         if all(joint in nodes for joint in entry["joints"]):
-            skinning = document.bones(skin)
+            skinning = document.skinning_matrices(skin)
             inverse_bind = np.linalg.inv(np.stack([worlds[joint] for joint in entry["joints"]])) @ skinning
             entry["inverseBindMatrices"] = editor.add_array(inverse_bind.swapaxes(1, 2).reshape(-1, 16).astype("<f4"))
     lost_clips = drop_channels(editor, lambda target: target.get("node") in nodes)

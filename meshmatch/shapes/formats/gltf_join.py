@@ -42,13 +42,13 @@ def joined(document: Document, added: Document, binding: Binding | None) -> byte
     meshes, frames = _copy_meshes(editor, added, parts)
     joint_rows, weight_rows = (None, None) if binding is None or not joints else binding.table()
     n_verts = 0
-    for (number, own), mesh, frame in zip(parts.items(), meshes, frames, strict=True):
+    for (number, primitives), mesh, frame in zip(parts.items(), meshes, frames, strict=True):
         mesh_entry = editor.json["meshes"][mesh]
         entry: dict[str, Any] = {"mesh": mesh}
         if name := added.nodes[number].get("name") or mesh_entry.get("name"):
             entry["name"] = name
         entry |= {key: added.nodes[number][key] for key in ("weights", "extras") if key in added.nodes[number]}
-        for k, part in own.items():
+        for k, part in primitives.items():
             rows = slice(n_verts, n_verts + added.count(part["attributes"]["POSITION"]))
             n_verts = rows.stop
             attributes = mesh_entry["primitives"][k]["attributes"]
@@ -80,9 +80,9 @@ def _copy_meshes(
     offset = {kind: len(editor.json.get(kind, [])) for kind in _KINDS}
     meshes = [copy.deepcopy(other.json["meshes"][added.nodes[number]["mesh"]]) for number in parts]
     frames = []
-    for (number, own), mesh in zip(parts.items(), meshes, strict=True):
-        frame = frame_of(added, number, own)
-        for k, part in own.items() if frame is None else ():
+    for (number, primitives), mesh in zip(parts.items(), meshes, strict=True):
+        frame = frame_of(added, number, primitives)
+        for k, part in primitives.items() if frame is None else ():
             bake_transform(other, added, number, part, mesh["primitives"][k])
         frames.append(np.eye(4) if frame is None else frame)
     other.json |= {"meshes": meshes, "skins": [], "animations": []}
@@ -100,6 +100,6 @@ def _copy_meshes(
     gltf_vrm.complete_properties(editor.json, gltf_vrm.properties(other.json))
     for key in ("extensionsUsed", "extensionsRequired"):
         added_names = [name for name in other.json.get(key, []) if name not in gltf_vrm.ROOTS]
-        if listed := [*editor.json.get(key, []), *added_names]:
-            editor.json[key] = list(dict.fromkeys(listed))
+        if extension_names := [*editor.json.get(key, []), *added_names]:
+            editor.json[key] = list(dict.fromkeys(extension_names))
     return [offset["meshes"] + k for k in range(len(meshes))], frames

@@ -55,21 +55,26 @@ def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Floa
         node.pop("weights", None)
         index_of = {name: k for k, name in enumerate(before)}
         kept = [k for k, name in enumerate(before) if name not in replaced]
-        for k, own in enumerate(mesh["primitives"]):
-            rows = slice(start, start + document.count(own["attributes"]["POSITION"]) if k in parts else start)
+        for k, primitive in enumerate(mesh["primitives"]):
+            rows = slice(start, start + document.count(primitive["attributes"]["POSITION"]) if k in parts else start)
             start = rows.stop
-            targets = [own["targets"][j] for j in kept]
+            targets = [primitive["targets"][j] for j in kept]
             has_normals = (
-                normals is not None and "NORMAL" in own["attributes"] and all("NORMAL" in each for each in targets)
+                normals is not None
+                and "NORMAL" in primitive["attributes"]
+                and all("NORMAL" in each for each in targets)
             )
             own_normals = normals[:, rows] if normals is not None and has_normals else None
-            own["targets"] = [*targets, *_add_targets(editor, document, number, own, added.moves[:, rows], own_normals)]
+            primitive["targets"] = [
+                *targets,
+                *_add_targets(editor, document, number, primitive, added.moves[:, rows], own_normals),
+            ]
         mesh["weights"] = [*(weights[k] for k in kept), *added.weights.tolist()]
         names = {"targetNames": [*(before[k] for k in kept), *added.names]}
         mesh["extras"] = (mesh["extras"] if isinstance(mesh.get("extras"), dict) else {}) | names
-        for own in mesh["primitives"]:
-            if isinstance(own.get("extras"), dict) and "targetNames" in own["extras"]:
-                own["extras"] |= names
+        for primitive in mesh["primitives"]:
+            if isinstance(primitive.get("extras"), dict) and "targetNames" in primitive["extras"]:
+                primitive["extras"] |= names
         columns = [*kept, *(index_of.get(name, -1) for name in added.names)]
         for animation, channel in animated.get(number, ()):
             _retarget_channel(editor, document, animation, channel, columns, mesh["weights"])
@@ -104,14 +109,14 @@ def _read_morphs(document: Document) -> BlendShapes:
     check_element_count(document.name, document.size, len(names) * sum(counts) // 4)
     moves = np.zeros((len(names), sum(counts), 3), np.float32)
     n_verts, normals = 0, True
-    for (number, part, place), count in zip(parts, counts, strict=True):
+    for (number, part, matrix), count in zip(parts, counts, strict=True):
         own_names = _names(document, document.nodes[number]["mesh"])
         for name, target in zip(own_names, part.get("targets", []), strict=True):
             normals &= "NORMAL" in target
             if "POSITION" in target:
-                own = document.accessor(target["POSITION"])
-                own = np.hstack([own, np.zeros((len(own), 1))])
-                moves[names[name], n_verts : n_verts + count] = document.moved(number, part, own, place)
+                displacement = document.accessor(target["POSITION"])
+                displacement = np.hstack([displacement, np.zeros((len(displacement), 1))])
+                moves[names[name], n_verts : n_verts + count] = document.to_scene(number, part, displacement, matrix)
         n_verts += count
     if not (np.isfinite(moves).all() and np.isfinite(weights).all()):
         raise ValueError("a vertex is moved to nowhere")
@@ -125,23 +130,23 @@ def _names(document: Document, number: int) -> tuple[str, ...]:
     all_extras = [each.get("extras") for each in (mesh, *mesh["primitives"])]  # VRM 0.x has the names in primitives
     given_lists = [extras.get("targetNames") for extras in all_extras if isinstance(extras, dict)]
     given_names = next((names for names in given_lists if isinstance(names, list)), [])
-    names, taken = list[str](), set[str]()
+    names, used_names = list[str](), set[str]()
     for k in range(len(mesh["primitives"][0].get("targets", []))):
         name = (
             plain_text(given_names[k])
             if k < len(given_names) and isinstance(given_names[k], str) and given_names[k]
             else f"shape {k}"
         )
-        names.append(name if name not in taken else f"{name} ({k})")
-        taken.add(names[-1])
+        names.append(name if name not in used_names else f"{name} ({k})")
+        used_names.add(names[-1])
     return tuple(names)
 
 
 def _initial_weights(node: dict[str, Any], mesh: dict[str, Any]) -> list[float]:
     """Initial weights of the morph targets of a node's mesh."""
     n_targets = len(mesh["primitives"][0].get("targets", []))
-    given = [float(weight) for weight in node.get("weights", mesh.get("weights", []))]
-    return (given + [0.0] * n_targets)[:n_targets]
+    weights = [float(weight) for weight in node.get("weights", mesh.get("weights", []))]
+    return (weights + [0.0] * n_targets)[:n_targets]
 
 
 def _channels(document: Document, animation: dict[str, Any]) -> list[tuple[int, dict[str, Any], dict[str, Any]]]:
@@ -174,12 +179,12 @@ def _clips(document: Document, names: dict[str, int], rest: Float[Floats, " K"])
     for number, animation in enumerate(document.json.get("animations", [])):
         tracks: dict[int, tuple[Floats, Floats, str]] = {}
         for node, _, sampler in _channels(document, animation):
-            own = _names(document, document.nodes[node]["mesh"])
-            times, values, interpolation = _track(document, sampler, len(own))
+            target_names = _names(document, document.nodes[node]["mesh"])
+            times, values, interpolation = _track(document, sampler, len(target_names))
             keys += len(times) * len(names)
             if keys > _BASE_WEIGHTS + document.size // 4:
                 raise InputError(f"the clips of {document.name} hold over {_BASE_WEIGHTS:,} weights", "export fewer")
-            for k, name in enumerate(own):
+            for k, name in enumerate(target_names):
                 tracks.setdefault(names.get(name, -1), (times, values[:, k], interpolation))
         tracks.pop(-1, None)  # targets of a mesh that the scene does not draw
         if tracks:
@@ -200,9 +205,9 @@ def _merge_tracks(name: str, tracks: dict[int, tuple[Floats, Floats, str]], rest
     weights = np.tile(rest, (rows, 1))
     if interpolation == "CUBICSPLINE":
         weights[0::3], weights[2::3] = 0.0, 0.0
-    for k, (own, values, kind) in tracks.items():
+    for k, (track_times, values, kind) in tracks.items():
         keys = values[1::3] if kind == "CUBICSPLINE" and not same_keys else values
-        weights[:, k] = keys if same_keys else np.interp(times, own, keys)
+        weights[:, k] = keys if same_keys else np.interp(times, track_times, keys)
     return WeightClip(name, times, weights, interpolation)
 
 
@@ -210,7 +215,7 @@ def _add_targets(
     editor: Editor,
     document: Document,
     number: int,
-    own: dict[str, Any],
+    primitive: dict[str, Any],
     moves: Float[Floats32, "K V 3"],
     normals: Float[Floats32, "N V 3"] | None,
 ) -> Iterator[dict[str, int]]:
@@ -219,20 +224,20 @@ def _add_targets(
     ``moves`` are the displacements of its vertices in scene coordinates; ``normals`` the scene normals at rest, followed by
     those with each blendshape at weight 1, or None for targets without normals.
     """
-    frames = frames_of(document, number, own)
+    frames = frames_of(document, number, primitive)
     to_local, stored = np.linalg.pinv(frames), np.empty((0, 3))
     if normals is not None:
-        stored = unit(document.accessor(own["attributes"]["NORMAL"]))
-        local_rest = unit(np.einsum("vji,vj->vi", to_local, stored))
+        stored = unit(document.accessor(primitive["attributes"]["NORMAL"]))
+        scene_normals = unit(np.einsum("vji,vj->vi", to_local, stored))
     for k, move in enumerate(moves):
-        local = np.einsum("vij,vj->vi", to_local, move)
-        target = {"POSITION": editor.add_sparse(local.astype("<f4"), bounds=True)}
+        local_moves = np.einsum("vij,vj->vi", to_local, move)
+        target = {"POSITION": editor.add_sparse(local_moves.astype("<f4"), bounds=True)}
         if normals is not None:
             rest, deformed = normals[0], normals[1 + k]
-            local_normals = np.einsum("vij,vj->vi", shortest_turns(rest, deformed), local_rest)
-            local_normals = unit(np.einsum("vji,vj->vi", frames, local_normals)) - stored
-            local_normals[(deformed == rest).all(axis=1)] = 0.0
-            target["NORMAL"] = editor.add_sparse(local_normals.astype("<f4"))
+            rotated = np.einsum("vij,vj->vi", shortest_turns(rest, deformed), scene_normals)
+            rotated = unit(np.einsum("vji,vj->vi", frames, rotated)) - stored  # displacements of local normals
+            rotated[(deformed == rest).all(axis=1)] = 0.0
+            target["NORMAL"] = editor.add_sparse(rotated.astype("<f4"))
         yield target
 
 

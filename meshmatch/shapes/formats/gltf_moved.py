@@ -47,13 +47,14 @@ def _move(
     document: Document,
     number: int,
     part: dict[str, Any],
-    own: dict[str, Any],
+    primitive: dict[str, Any],
     verts: Float[Floats, "N 3"],
     turns: Float[Floats, "N 3 3"],
 ) -> None:
-    place = document.world[number]
-    before, frames = document.placed(number, part, place), frames_of(document, number, part)
-    origin = document.moved(number, part, np.tile([0.0, 0.0, 0.0, 1.0], (len(verts), 1)), place)
+    """Store a primitive with new positions, and rotate its normals, tangents and morph targets."""
+    matrix = document.world[number]
+    before, frames = document.scene_positions(number, part, matrix), frames_of(document, number, part)
+    origin = document.to_scene(number, part, np.tile([0.0, 0.0, 0.0, 1.0], (len(verts), 1)), matrix)
     to_local = np.linalg.pinv(frames)
     unmoved = np.asarray(~np.isfinite(verts).all(axis=1))
     now = np.where(unmoved[:, None], before, verts)
@@ -64,7 +65,7 @@ def _move(
         values = document.accessor(accessor)
         return np.hstack([np.einsum("vij,vj->vi", by, values[:, :3]), values[:, 3:]])
 
-    attributes = own["attributes"]
+    attributes = primitive["attributes"]
     local = np.einsum("vij,vj->vi", to_local, now - origin)
     attributes["POSITION"] = editor.add_array(local.astype("<f4"), bounds=True, target=VERTICES)
     for key, by in (("NORMAL", normal_maps), ("TANGENT", local_turns)):
@@ -72,8 +73,8 @@ def _move(
             values = rows(attributes[key], by)
             values[:, :3] = unit(values[:, :3])
             attributes[key] = editor.add_array(values.astype("<f4"), target=VERTICES)
-    stretch = _stretch(before, now, document.triangles(part)) if "targets" in own else np.ones(len(now))
-    for target in own.get("targets", []):
+    stretch = _stretch(before, now, document.triangles(part)) if "targets" in primitive else np.ones(len(now))
+    for target in primitive.get("targets", []):
         for key, by in (
             ("POSITION", stretch[:, None, None] * local_turns),
             ("NORMAL", normal_maps),

@@ -178,7 +178,7 @@ def smooth_normals(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Floa
     A vertex without a face gets the z axis, since glTF requires unit length everywhere.
     """
     representative = same_rows(verts)
-    own, shared = vertex_normals(verts, faces), vertex_normals(verts, representative[faces])[representative]
-    normals = np.where((dot(own, shared) > _MIN_SEAM_COSINE)[:, None], shared, own)
+    separate, shared = vertex_normals(verts, faces), vertex_normals(verts, representative[faces])[representative]
+    normals = np.where((dot(separate, shared) > _MIN_SEAM_COSINE)[:, None], shared, separate)
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     return normals

@@ -176,16 +176,16 @@ def _decompose(name: str, node: dict[str, Any]) -> tuple[Floats, Floats, Floats]
     """
     local = local_matrix(node)
     if "matrix" in node:
-        left, _, right = np.linalg.svd(local[:3, :3])
-        turn = left @ right
-        scale = np.einsum("ij,ij->j", turn, local[:3, :3])
+        u, _, vt = np.linalg.svd(local[:3, :3])
+        rotation = u @ vt
+        scale = np.einsum("ij,ij->j", rotation, local[:3, :3])
     else:
-        turn = local_matrix({"rotation": node.get("rotation", (0, 0, 0, 1))})[:3, :3]
+        rotation = local_matrix({"rotation": node.get("rotation", (0, 0, 0, 1))})[:3, :3]
         scale = np.array(node.get("scale", (1, 1, 1)), np.float64)
-    if np.linalg.det(turn) < 0 or scale.prod() < 0:
+    if np.linalg.det(rotation) < 0 or scale.prod() < 0:
         hint = "apply the scale of its armature before it is exported"
         raise InputError(f"the skeleton of {name} is mirrored by a negative scale", hint)
-    return Rotation.from_matrix(turn).as_quat(), local[:3, 3], scale
+    return Rotation.from_matrix(rotation).as_quat(), local[:3, 3], scale
 
 
 def _clips(document: Document, index_of: dict[int, int]) -> tuple[Clip, ...]:

@@ -116,17 +116,20 @@ def frame_of(document: Document, number: int, parts: dict[int, dict[str, Any]]) 
     None if a skin deforms them (no single matrix does) or if they are mirrored: viewers disagree on which side of a
     triangle is outside if joints mirror it.
     """
-    place = document.world[number]
-    if any(document.mirrors(number, part, place) for part in parts.values()):
+    matrix = document.world[number]
+    if any(document.is_mirrored(number, part, matrix) for part in parts.values()):
         return None
     if "skin" not in document.nodes[number]:
-        return place
-    bones = document.bones(document.nodes[number]["skin"])
+        return matrix
+    bones = document.skinning_matrices(document.nodes[number]["skin"])
     frame = None
     for part in parts.values():
-        positions, in_scene = document.accessor(part["attributes"]["POSITION"]), document.placed(number, part, place)
+        positions, in_scene = (
+            document.accessor(part["attributes"]["POSITION"]),
+            document.scene_positions(number, part, matrix),
+        )
         if frame is None:
-            frame = place
+            frame = matrix
             if "JOINTS_0" in part["attributes"]:
                 joints, weights = next(document.influences(part))
                 frame = bones[int(joints[0, weights[0].argmax()])]
@@ -140,26 +143,26 @@ def bake_transform(
     editor: Editor, document: Document, number: int, part: dict[str, Any], primitive: dict[str, Any]
 ) -> None:
     """Store a primitive in scene coordinates: positions, normals, tangents and morph targets; mirrored faces are flipped."""
-    place = document.world[number]
+    matrix = document.world[number]
 
     def transform(accessor: int, normalize: bool) -> Floats:
         values = document.accessor(accessor)
         directions = np.hstack([values[:, :3], np.zeros((len(values), 1))])
-        vectors = document.moved(number, part, directions, place)
+        vectors = document.to_scene(number, part, directions, matrix)
         if normalize:
             vectors = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
         return np.hstack([vectors, values[:, 3:]])
 
     attributes = primitive["attributes"]
-    in_scene = document.placed(number, part, place).astype("<f4")
+    in_scene = document.scene_positions(number, part, matrix).astype("<f4")
     attributes["POSITION"] = editor.add_array(in_scene, bounds=True, target=VERTICES)
     for key in [key for key in _DIRECTIONS if key in attributes]:
         attributes[key] = editor.add_array(transform(attributes[key], True).astype("<f4"), target=VERTICES)
     for target in primitive.get("targets", []):
         for key in [key for key in ("POSITION", *_DIRECTIONS) if key in target]:
             target[key] = editor.add_array(transform(target[key], False).astype("<f4"), bounds=key == "POSITION")
-    faces = document.drawn_triangles(number, part, place)
-    if len(faces) and document.mirrors(number, part, place):
+    faces = document.drawn_triangles(number, part, matrix)
+    if len(faces) and document.is_mirrored(number, part, matrix):
         primitive["indices"] = editor.add_indices(faces, len(in_scene))
         primitive.pop("mode", None)
 

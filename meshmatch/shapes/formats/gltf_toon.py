@@ -113,6 +113,7 @@ class ToonMaterials:
         self._warn({new: str(materials[new].get("name", "")) for new in made.values()})
 
     def _rewrite_old(self, before: Json, moved: bool) -> Json:
+        """Rewrite the properties of a VRM 0.x toon material; ``moved``: its texture coordinates have been replaced."""
         entry, baked = copy.deepcopy(before), self.baked
         groups = ("floatProperties", "vectorProperties", "textureProperties", "keywordMap", "tagMap")
         floats, vectors, textures, keywords, tags = (entry.setdefault(key, {}) for key in groups)
@@ -156,6 +157,7 @@ class ToonMaterials:
         tags["RenderType"], entry["renderQueue"] = tag, queue
 
     def _warn(self, material_names: Mapping[int, str]) -> None:
+        """Warn of shade images, other textures and texture animations that are lost or changed."""
         if self.lost_shades:
             what = "images of their own for the shade, where the new texture is seen now"
             warn(f"{self.name} has materials with {what}: {_listed(self.lost_shades)}")

@@ -64,7 +64,7 @@ def references(json: Json) -> Iterator[tuple[str, Any, Any]]:
 
 
 def copy_mesh(json: Json, old: int, new: int) -> None:
-    """Apply the expressions and first-person settings of a mesh to a copy of it as well."""
+    """Apply the expressions and first-person settings (VRM 0.x) of a mesh to a copy of it as well."""
     extension = nested(json, "extensions", VRM0)
     lists = [nested(group, "binds") for group in nested_entries(extension, "blendShapeMaster", "blendShapeGroups")]
     for items in (*lists, nested(extension, "firstPerson", "meshAnnotations")):
@@ -84,7 +84,7 @@ def reorder_targets(json: Json, node: int, mesh: int, columns: Sequence[int]) ->
 
 
 def copy_material(json: Json, old: int, new: int) -> None:
-    """Apply the expressions that change a material to a copy of it as well."""
+    """Apply the expressions (VRM 1.0) that change a material to a copy of it as well."""
     for expression in _expressions(json):
         for key in ("materialColorBinds", "textureTransformBinds"):
             binds = expression.get(key)

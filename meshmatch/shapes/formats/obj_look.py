@@ -100,9 +100,9 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
     )
     corners[face_has_uv, :, 1] = 1.0 - corners[face_has_uv, :, 1]
     if not materials or (picture is None and all(material.image is None for material in materials)):
-        bare = appearance.vertex_colors_alone(shape)
-        if bare.colors is not None or not materials:
-            return bare
+        vertex_colors = appearance.vertex_colors_alone(shape)
+        if vertex_colors.colors is not None or not materials:
+            return vertex_colors
     if picture is not None and not face_has_uv.any():
         raise appearance.no_coordinates(path.name)
     return Appearance(tuple(materials), material_index, corners)
@@ -155,9 +155,9 @@ def _surface(name: str, entry: _Entry, rough: Pixels | None, metal: Pixels | Non
         warn(f"the maps of roughness and metal of {name} differ in size: the second is left out")
         metal = None
     image = np.full_like(rough if rough is not None else metal, 255)
-    for channel, given in ((1, rough), (2, metal)):
-        if given is not None:
-            image[..., channel], factors[channel] = given[..., 0], 1.0
+    for channel, channel_image in ((1, rough), (2, metal)):
+        if channel_image is not None:
+            image[..., channel], factors[channel] = channel_image[..., 0], 1.0
     return Material(name, image, (factors[0], factors[1], factors[2], 1.0), linear=True)
 
 
@@ -340,8 +340,10 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """Read all mtl files that are referred to; a missing one raises `InputError`, unless the shape has vertex colors."""
     entries: dict[str, _Entry] = {}
     for name in dict.fromkeys(names):
-        whole = beside(path.parent, name)
-        for file in [whole] if whole is not None else _library_files(path.parent, _uncommented(name)):
+        file_with_spaces = beside(path.parent, name)
+        for file in (
+            [file_with_spaces] if file_with_spaces is not None else _library_files(path.parent, _uncommented(name))
+        ):
             if file is not None:
                 entries |= _parse(file)
             elif shape.colors is None:
@@ -354,8 +356,8 @@ def _library_files(folder: Path, names: str) -> list[Path | None]:
     """Resolve an mtllib line that has one file name, perhaps with spaces, or several; None for a missing file."""
     several = [beside(folder, word) for word in names.split(None, _MAX_LIBRARIES)[:_MAX_LIBRARIES]]
     if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
-        whole = beside(folder, names)
-        return several if whole is None else [whole]
+        file_with_spaces = beside(folder, names)
+        return several if file_with_spaces is None else [file_with_spaces]
     return several
 
 

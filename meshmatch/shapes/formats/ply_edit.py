@@ -203,9 +203,9 @@ class _Plan:
     @property
     def added(self) -> list[Property]:
         """New properties, which are appended to those that are kept."""
-        there = {p.name for p in self.kept}
+        kept_names = {p.name for p in self.kept}
         kinds = {name: KINDS.get(values.dtype.name, "double") for name, values in self.columns.items()}
-        return [Property(name, kind) for name, kind in kinds.items() if name not in there]
+        return [Property(name, kind) for name, kind in kinds.items() if name not in kept_names]
 
 
 def _can_hold(p: Property, values: NDArray[Any]) -> bool:
@@ -224,8 +224,10 @@ def _rewrite_header(head: bytes, plans: Sequence[_Plan], comments: Sequence[str]
         if words[:1] == [b"element"] and len(words) > 2:
             lines += _declared(plan)
             plan = next(waiting)
-        named = words[4 if words[1:2] == [b"list"] else 2].decode("latin-1") if words[:1] == [b"property"] else ""
-        if not (plan and named in plan.removed) and not (labeled and _LABEL_COMMENT.match(line)):
+        property_name = (
+            words[4 if words[1:2] == [b"list"] else 2].decode("latin-1") if words[:1] == [b"property"] else ""
+        )
+        if not (plan and property_name in plan.removed) and not (labeled and _LABEL_COMMENT.match(line)):
             lines.append(line)
         if words[:1] == [b"format"]:
             lines += [f"comment {' '.join(comment.split())}".encode() for comment in comments]

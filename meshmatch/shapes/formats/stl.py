@@ -129,10 +129,12 @@ def write(path: Path, shape: Shape) -> None:
     rows["corners"] = as_float32(corners, ".stl")
     lengths = np.linalg.norm(shape.face_vectors, axis=1)
     rows["normal"] = shape.face_vectors / np.where(lengths > 0, lengths, 1.0)[:, None]
-    moved = float(np.abs(rows["corners"] - corners).max())
-    if moved > _MAX_ROUNDING * shape.diagonal:
+    displacement = float(np.abs(rows["corners"] - corners).max())
+    if displacement > _MAX_ROUNDING * shape.diagonal:
         where = "this far from the origin its vertices move by up to"
-        warn(f"an stl file has 32-bit numbers: {where} {moved:.2g}; ply, obj, off and glb files keep them in place")
+        warn(
+            f"an stl file has 32-bit numbers: {where} {displacement:.2g}; ply, obj, off and glb files keep them in place"
+        )
     path.write_bytes(
         b"meshmatch".ljust(_HEADER_BYTES - 4, b"\0") + np.array([shape.F], "<u4").tobytes() + rows.tobytes()
     )

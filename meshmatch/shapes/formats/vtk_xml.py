@@ -172,13 +172,14 @@ class _File:
         return raw_of(self.name, self.size, np.concatenate(verts), cells, vertex_colors)
 
     def point_arrays(self) -> dict[str, NDArray[Any]]:
-        parts = [self._of_points(piece) for piece in self.root.findall("./*/Piece")]
+        parts = [self._piece_point_arrays(piece) for piece in self.root.findall("./*/Piece")]
         names = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
         widths = {name: {part[name].shape[1:] for part in parts} for name in names}
         return {name: np.concatenate([part[name] for part in parts]) for name in names if len(widths[name]) == 1}
 
-    def _of_points(self, piece: ElementTree.Element) -> dict[str, NDArray[Any]]:
-        found, count = {}, _count(self.name, piece, "NumberOfPoints")
+    def _piece_point_arrays(self, piece: ElementTree.Element) -> dict[str, NDArray[Any]]:
+        """Point arrays of one piece by name, without colors."""
+        arrays, count = {}, _count(self.name, piece, "NumberOfPoints")
         for element in piece.findall("./PointData/DataArray"):
             components = element.get("NumberOfComponents", "1")
             width = int(components) if re.fullmatch("[1-9][0-9]{0,3}", components) else 1
@@ -186,8 +187,8 @@ class _File:
                 self._reset_budget()
                 values = self._array(element)
                 if values.size == count * width:
-                    found[element.get("Name", "value")] = values.reshape(count, width) if width > 1 else values
-        return found
+                    arrays[element.get("Name", "value")] = values.reshape(count, width) if width > 1 else values
+        return arrays
 
     def _reset_budget(self) -> None:
         """Reset the number of bytes that may be decompressed from now on."""
