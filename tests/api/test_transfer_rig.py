@@ -294,7 +294,7 @@ def test_meshes_that_move_something_else(source: Path) -> None:
     document |= {"animations": [clip]}
     write_document(target, document, *arrays)
     where = load_shape(target).verts
-    with pytest.warns(MeshmatchWarning, match="clips of target.glb that moved a mesh as a whole do so no more"):
+    with pytest.warns(MeshmatchWarning, match="clips of target.glb that moved a mesh as a whole no longer do"):
         out, _ = rigged(source, target)
     found = Document(out, out.read_bytes()).json
     assert found["scenes"][0]["nodes"] == [3, 0, 1, 2, 4]
@@ -478,7 +478,7 @@ def test_a_mirror_above_a_target_turns_nothing_inside_out(source: Path, skinned:
     found = Document(out, out.read_bytes())
     ((number, part, place),) = found.primitives()
     stored = found.accessor(part["attributes"]["POSITION"])
-    assert not found.mirrors(number, part, place) and np.linalg.det(place[:3, :3]) > 0
+    assert not found.is_mirrored(number, part, place) and np.linalg.det(place[:3, :3]) > 0
     assert volume(stored, found.triangles(part)) > 0
     assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
     assert np.array_equal(load_shape(out).faces, shape.faces)
@@ -502,7 +502,7 @@ def test_nodes_that_something_else_needs_stay(source: Path) -> None:
     before = Document(target, target.read_bytes())
     before.scene()
     with pytest.warns(
-        MeshmatchWarning, match="^eye of target.glb hung from the skeleton that is replaced, and stays where"
+        MeshmatchWarning, match="^eye of target.glb, below the skeleton that is replaced, keeps its position"
     ):
         out, _ = rigged(source, target)
     found = Document(out, out.read_bytes())

@@ -71,7 +71,7 @@ def test_a_texture_is_what_the_lit_and_the_shaded_side_show(character: Path) -> 
 
 
 def test_shading_keeps_its_tint(character: Path) -> None:
-    with pytest.warns(MeshmatchWarning, match=r"images of their own for the shade.*: skin$"):
+    with pytest.warns(MeshmatchWarning, match=r"separate shade images.*: skin$"):
         out = dressed(character, own=True)
     document = read(out)
     assert toon_images(document)["_RimTexture"] == "rim"  # its coordinates are still there
@@ -89,7 +89,7 @@ def test_shading_keeps_its_tint(character: Path) -> None:
 
 def test_other_textures_of_a_toon_material_under_new_coordinates_are_told(character: Path) -> None:
     with (
-        pytest.warns(MeshmatchWarning, match="for the shade"),
+        pytest.warns(MeshmatchWarning, match="separate shade images"),
         pytest.warns(MeshmatchWarning, match=r"other textures of toon materials of square.vrm .*: skin$"),
     ):
         out = dressed(character)
@@ -180,7 +180,7 @@ def test_names_of_morph_targets_may_stand_in_primitives(character: Path) -> None
 def test_colors_are_told_where_a_toon_material_shows_none(character: Path) -> None:
     before, out, shape = said(character), character.with_name("out.vrm"), load_shape(character)
     painted = Shape(shape.verts, shape.faces, "square", np.tile([1.0, 0, 0, 1], (shape.V, 1)))
-    with pytest.warns(MeshmatchWarning, match="no colors of vertices on the toon material skin of square.vrm"):
+    with pytest.warns(MeshmatchWarning, match="do not show vertex colors on the toon material skin of square.vrm"):
         save_colored(out, painted, character, np.eye(3))
     assert said(out) == before
     np.testing.assert_allclose(load_shape(out).colors, painted.colors, atol=1e-6)

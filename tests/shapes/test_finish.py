@@ -89,7 +89,7 @@ def test_what_cannot_be_read_is_told_and_the_rest_is_there(tmp_path: Path) -> No
     assert [str(each.message) for each in told] == [
         "the normal map of a.gltf cannot be read and is left out: a.gltf needs the file gone.png, which is not in its "
         "folder",
-        "the materials of a.gltf have what is not transferred: clearcoat",
+        "the materials of a.gltf use extensions that are not transferred: clearcoat",
     ]
     assert sorted(found.layers) == ["glow", "occlusion", "surface"]
 

@@ -133,7 +133,7 @@ def test_voxels_in_a_file_beside_it(tmp_path: Path, name: str, header: Callable[
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / name).write_bytes(header(where="../a.raw"))
     (tmp_path / "a.raw").write_bytes(voxels())
-    with pytest.raises(InputError, match=r"there is no file \.\./a\.raw beside it"):
+    with pytest.raises(InputError, match=r"there is no file \.\./a\.raw in its folder"):
         load_shape(tmp_path / "in" / name)
     (tmp_path / name).write_bytes(header(where="a.raw"))
     assert [label for label, _ in mesh_list(tmp_path / name)] == ["3", "7"]
@@ -189,20 +189,20 @@ BAD: dict[str, tuple[str, bytes, str]] = {
         "bytes of voxels, not 5,544",
     ),
     "not packed": ("a.nrrd", nrrd(encoding="gzip") + voxels(), "its header or its data cannot be read"),
-    "hex": ("a.nrrd", nrrd(encoding="hex") + voxels(), "is packed by hex"),
+    "hex": ("a.nrrd", nrrd(encoding="hex") + voxels(), "has the unsupported encoding hex"),
     "vectors": ("a.mha", meta(more="ElementNumberOfChannels = 3\n") + voxels(), "3 dimensions and 3 channels"),
     "a picture": ("a.mha", meta(sizes=(22, 18)) + voxels(), "has 2 dimensions"),
     "one slice": ("a.mha", meta(sizes=(22, 252, 1)) + voxels(), "22 x 252 x 1 voxels, which have no surface"),
     "no sizes": ("a.mha", meta().replace(b"DimSize", b"Size") + voxels(), "cannot be read"),
     "words for sizes": ("a.mha", meta().replace(b"22 18 14", b"a b c") + voxels(), "cannot be read"),
     "no size": ("a.mha", meta(sizes=(22, -18, 14)) + voxels(), "its sizes are 22 x -18 x 14"),
-    "flat": ("a.mha", meta().replace(b"Spacing = 0.5", b"Spacing = 0.0") + voxels(), "span a space"),
-    "not finite": ("a.mha", meta().replace(b"Offset = 10", b"Offset = nan") + voxels(), "span a space"),
-    "complex": ("a.nii", nifti(code=32) + voxels(), "voxels of kind 32"),
+    "flat": ("a.mha", meta().replace(b"Spacing = 0.5", b"Spacing = 0.0") + voxels(), "do not span the space"),
+    "not finite": ("a.mha", meta().replace(b"Offset = 10", b"Offset = nan") + voxels(), "do not span the space"),
+    "complex": ("a.nii", nifti(code=32) + voxels(), "voxels of type 32"),
     "several volumes": ("a.nii", nifti(dims=(4, 22, 18, 7, 2)) + voxels(), "other than three dimensions"),
-    "an offset": ("a.nii", nifti(offset=1e30) + voxels(), "no numbers of labels"),
+    "an offset": ("a.nii", nifti(offset=1e30) + voxels(), "which cannot be labels"),
     "NIfTI-2": ("a.nii", struct.pack("<i", 540) + bytes(600), "not a NIfTI-1 file"),
-    "a list of files": ("a.mhd", meta(where="LIST"), "no file LIST beside it"),
+    "a list of files": ("a.mhd", meta(where="LIST"), "no file LIST in its folder"),
     "an archive": ("a.tar.gz", gzip.compress(b"nothing"), "unsupported file format .gz"),
     "too many layers": (
         "a.nrrd",

@@ -198,7 +198,7 @@ def test_the_other_image_and_what_is_missing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"needs the image gone\.png"):
         find_appearance(path, shape)
     path.write_text(vertex_pairs("a", "b", "comment TextureFile other.png\n"))
-    with pytest.warns(MeshmatchWarning, match=r"names the image other\.png, but no texture coordinates"):
+    with pytest.warns(MeshmatchWarning, match=r"names the image other\.png, but has no texture coordinates"):
         assert find_appearance(path, load_shape(path)) is None
     assert load_coordinates(path, load_shape(path)) is None
     with pytest.raises(InputError, match="no texture coordinates"):
@@ -212,7 +212,7 @@ def test_vertex_colors_stand_in_for_an_image_that_is_gone(tmp_path: Path) -> Non
     body = rows(np.hstack([SQUARE, np.full((4, 3), 51)])) + "4 0 1 2 3 8 0 0 1 0 1 1 0 1\n"
     (tmp_path / "a.ply").write_text(text + body)
     shape = load_shape(tmp_path / "a.ply")
-    with pytest.warns(MeshmatchWarning, match="vertex colors are taken"):
+    with pytest.warns(MeshmatchWarning, match="vertex colors are used"):
         look = load_appearance(tmp_path / "a.ply", shape)
     assert not look.textured
     assert look.colors is not None

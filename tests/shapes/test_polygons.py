@@ -154,7 +154,9 @@ def test_the_work_on_one_file_is_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_quads_are_split_together(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[int] = []
     ears = polygons._clip_ears
-    monkeypatch.setattr(polygons, "_clip_ears", lambda places, sizes: [calls.append(len(sizes)), ears(places, sizes)][1])
+    monkeypatch.setattr(
+        polygons, "_clip_ears", lambda places, sizes: [calls.append(len(sizes)), ears(places, sizes)][1]
+    )
     rng = np.random.default_rng(0)
     verts = rng.normal(size=(100_000, 3))
     corners, sizes = rng.integers(0, len(verts), 4 * 50_000), np.full(50_000, 4)

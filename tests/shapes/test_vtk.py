@@ -159,10 +159,10 @@ def test_strips_pixels_and_what_is_no_face(tmp_path: Path) -> None:
     assert load_shape(tmp_path / "strip.vtk").faces.tolist() == [[0, 1, 2], [2, 1, 3], [2, 3, 4]]
     grid = head + b"DATASET UNSTRUCTURED_GRID\n" + points
     (tmp_path / "pixel.vtk").write_bytes(grid + b"CELLS 2 8\n4 0 1 2 3 2 3 4\nCELL_TYPES 2\n8 3\n")
-    with pytest.warns(MeshmatchWarning, match="lines are no faces"):
+    with pytest.warns(MeshmatchWarning, match="lines are not faces"):
         assert load_shape(tmp_path / "pixel.vtk").faces.tolist() == [[0, 1, 3], [0, 3, 2]]
     (tmp_path / "tetra.vtk").write_bytes(grid + b"CELLS 1 5\n4 0 1 2 3\nCELL_TYPES 1\n10\n")
-    with pytest.raises(InputError, match="cells of VTK's kind 10") as caught:
+    with pytest.raises(InputError, match="cells of VTK type 10") as caught:
         load_shape(tmp_path / "tetra.vtk")
     assert "Extract Surface" in str(caught.value.hint)
     (tmp_path / "cloud.vtk").write_bytes(head + b"DATASET POLYDATA\n" + points)
@@ -221,7 +221,7 @@ BOMB = zlib.compress(bytes(300_000_000))
         ("a.vtk", old().replace(b"4 0 1 2 3", b"4 0 1 2 9"), "refers to vertex 9"),
         ("a.vtk", old().replace(b"POINTS 5", b"POINTS 99999999999"), "vertices and faces"),
         ("a.vtk", old().replace(b"POLYGONS", b"POLYGONES"), "where a section should begin"),
-        ("a.vtk", old().replace(b"3 0 1 4", b"3 0 1 1.5"), "not whole"),
+        ("a.vtk", old().replace(b"3 0 1 4", b"3 0 1 1.5"), "not an integer"),
         ("a.vtk", old(new=True).replace(b"\n0 4 7", b"\n1 4 7"), "does not begin at the first"),
         ("a.vtp", "<!DOCTYPE x [<!ENTITY a 'b'>]><VTKFile type='PolyData'/>".encode("utf-16"), "another encoding"),
         ("a.vtp", b"<?xml version='1.0' encoding='utf-7'?><VTKFile type='PolyData'/>", "another encoding"),

@@ -452,7 +452,7 @@ class Document:
         file = beside(self.path.parent, uri, uri=True)
         if file is None:
             missing = f"{self.name} needs the file {uri[:200]}, which is not in its folder"
-            raise InputError(missing, "copy it beside the gltf")
+            raise InputError(missing, "copy it to the folder of the gltf")
         return read_bytes(file)
 
 

@@ -89,7 +89,7 @@ def decompress(
             if what.startswith("WEIGHTS_") and values.dtype.kind == "f":
                 values = values / np.where(totals > 0, totals, 1.0)
             if values.size != _n_scalars(accessor):
-                raise damaged(name, f"it promises {accessor['count']} values of {what}, and holds others")
+                raise damaged(name, f"it promises {accessor['count']} values of {what}, but holds another number")
             table = values.astype(COMPONENTS[accessor["componentType"]]).reshape(accessor["count"], -1)
             accessor.pop("byteOffset", None)
             accessor["bufferView"] = len(views)
@@ -125,7 +125,7 @@ def _jobs(
     def piece(entry: dict[str, Any]) -> int:
         start, length = int(entry.get("byteOffset", 0)), int(entry["byteLength"])
         if min(start, length) < 0:
-            raise damaged(name, "the place of its compressed data is negative")
+            raise damaged(name, "the offset or length of its compressed data is negative")
         return pieces.setdefault((entry["buffer"], start, length), len(pieces))
 
     jobs = [{key: each.get(key, "NONE") for key in _STREAM} | {"data": piece(each)} for each in streams]

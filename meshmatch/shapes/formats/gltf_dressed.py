@@ -110,7 +110,7 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
     editor = Editor(document)
     if toon := toon_materials(document.json):
         hidden = f"{len(toon)} toon materials" if toon[1:] else f"the toon material {toon[0]}"
-        warn(f"programs show no colors of vertices on {hidden} of {document.name}; they show a texture")
+        warn(f"programs do not show vertex colors on {hidden} of {document.name}, but they do show textures")
     n_verts = 0
     for number, parts in drawn(document).items():
         mesh = editor.own_mesh(number)

@@ -58,7 +58,7 @@ def _finish(document: Document, reader: ImageReader) -> Finish | None:
     }
     if unsupported := unsupported - {*_READ}:
         extension_names = ", ".join(sorted(name.removeprefix(_MATERIAL_PREFIX) for name in unsupported))
-        warn(f"the materials of {document.name} have what is not transferred: {extension_names[:200]}")
+        warn(f"the materials of {document.name} use extensions that are not transferred: {extension_names[:200]}")
     unlit = all(_UNLIT in entry.get("extensions", {}) for entry in entries)
     return Finish(layers, max(light, 1.0), any(entry.get("doubleSided", False) for entry in entries), unlit)
 

@@ -196,5 +196,5 @@ def warn_of_detached(document: Document, joints: set[int], reattached: set[int])
                 names.append(plain_text(str(node.get("name") or f"node {number}")))
     if names:
         what = f"{', '.join(names[:_MAX_NAMES])}{', ...' if len(names) > _MAX_NAMES else ''} of {document.name}"
-        stay = "stays where it" if len(names) == 1 else "stay where they"
-        warn(f"{what} hung from the skeleton that is replaced, and {stay} stood")
+        stay = "keeps its" if len(names) == 1 else "keep their"
+        warn(f"{what}, below the skeleton that is replaced, {stay} position")

@@ -168,7 +168,7 @@ def _remove_rotations(editor: Editor, document: Document, nodes: range) -> dict[
     lost_clips = drop_channels(editor, lambda target: target.get("node") in nodes)
     if lost_clips:
         what = f"{len(lost_clips)} clips" if lost_clips[1:] else f"the clip {lost_clips[0]}"
-        warn(f"{document.name} does not have {what} of its skeleton: bones of VRM 0.x are not turned")
+        warn(f"{document.name} does not have {what} of its skeleton: bones of VRM 0.x have no rotation")
     return worlds
 
 

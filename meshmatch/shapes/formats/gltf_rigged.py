@@ -257,7 +257,7 @@ def _move_to_root(editor: Editor, document: Document, skinned: set[int]) -> None
         if number in above and number in parents:
             above.add(parents[number])
     if any(target.get("node") in above and target["path"] != "weights" for target in clips):
-        warn(f"clips of {document.name} that moved a mesh as a whole do so no more, for its skeleton moves it")
+        warn(f"clips of {document.name} that moved a mesh as a whole no longer do, since its skeleton moves it")
     drop_channels(editor, lambda target: target.get("node") in movable and target["path"] != "weights")
 
 

@@ -159,16 +159,16 @@ class ToonMaterials:
     def _warn(self, material_names: Mapping[int, str]) -> None:
         """Warn of shade images, other textures and texture animations that are lost or changed."""
         if self.lost_shades:
-            what = "images of their own for the shade, where the new texture is seen now"
+            what = "separate shade images, which the new texture replaces"
             warn(f"{self.name} has materials with {what}: {_listed(self.lost_shades)}")
         if self.lost_textures and self.before:
-            what = "that the new coordinates would displace are left out"
+            what = "that would not fit the new coordinates are left out"
             warn(f"other textures of toon materials of {self.name} {what}: {_listed(self.lost_textures)}")
         elif self.lost_textures:
-            what = "lie on its former coordinates, which few programs draw"
+            what = "use its former texture coordinates, which few programs support"
             warn(f"other textures of toon materials of {self.name} {what}: {_listed(self.lost_textures)}")
         if moving := gltf_vrm.moving_textures(self.json, material_names):
-            warn(f"expressions of {self.name} that move a texture move the new one: {_listed(moving)}")
+            warn(f"expressions of {self.name} that move a texture now move the new one: {_listed(moving)}")
 
 
 def _tint(lit: ArrayLike, shade: ArrayLike) -> np.ndarray[Any, np.dtype[np.float64]]:

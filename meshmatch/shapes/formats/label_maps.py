@@ -76,7 +76,7 @@ def read(path: Path, data: bytes) -> Raw:
         or not np.isfinite(label_map.origin).all()
         or not np.linalg.det(label_map.steps)
     ):
-        raise damaged(path.name, "its axes or its origin are no numbers that span a space")
+        raise damaged(path.name, "its axes or its origin are not finite, or its axes do not span the space")
     return label_surfaces(path.name, len(data), label_map.layers, label_map.names, label_map.origin, label_map.steps)
 
 
@@ -132,7 +132,7 @@ def _nifti(path: Path, data: bytes) -> _LabelMap:
     spacing = struct.unpack(f"{byte_order}8f", head[76:108])
     qform, sform = struct.unpack(f"{byte_order}2h", head[252:256])
     if kind not in _NIFTI_TYPES or not 0 <= offset < _MAX_HEADER_BYTES:
-        raise InputError(f"{path.name} has voxels of kind {kind}, which are no numbers of labels", "save a label map")
+        raise InputError(f"{path.name} has voxels of type {kind}, which cannot be labels", "save a label map")
     if slope not in (0.0, 1.0) or (slope and shift):
         raise InputError(
             f"{path.name} scales its numbers by {slope:g} and {shift:g}", "labels are whole numbers: save them"
@@ -266,7 +266,7 @@ def _meta_image(path: Path, data: bytes) -> _LabelMap:
 
 def _voxel_type(name: str, voxel_types: Mapping[str, str], word: str) -> str:
     if word not in voxel_types:
-        raise InputError(f"{name} has voxels of type {word[:30]}, which are no numbers of labels", "save a label map")
+        raise InputError(f"{name} has voxels of type {word[:30]}, which cannot be labels", "save a label map")
     return voxel_types[word]
 
 
@@ -274,7 +274,7 @@ def _read_data_file(path: Path, name: str) -> bytes:
     """Read the data file, in the same folder, that a header refers to."""
     file = beside(path.parent, name)
     if file is None:
-        problem = f"{path.name}: there is no file {name[:80]} beside it, which should hold its voxels"
+        problem = f"{path.name}: there is no file {name[:80]} in its folder, which should contain its voxels"
         raise InputError(problem, "keep both together, or save a .nrrd or .mha, which is one file")
     return read_bytes(file)
 
@@ -287,7 +287,9 @@ def _unpacker(name: str, encoding: str, content: bytes, kind: str) -> Callable[[
         return lambda need: _decompress(content, need, "gzip" if encoding[0] == "g" else "bz2")
     if encoding in ("ascii", "text", "txt"):
         return lambda need: parse_numbers(name, content).astype(kind).tobytes()[:need]
-    raise InputError(f"{name} is packed by {encoding[:20]}", "save it uncompressed, or by gzip")
+    raise InputError(
+        f"{name} has the unsupported encoding {encoding[:20]}", "save it uncompressed, or by gzip"
+    )
 
 
 _READERS: dict[str, Callable[[Path, bytes], _LabelMap]] = {

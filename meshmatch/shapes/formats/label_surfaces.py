@@ -132,7 +132,7 @@ def _labels_of(name: str, voxels: NDArray[Any]) -> NDArray[Any]:
     if min(labels) < 0 or max(labels) >= 2**53:
         raise InputError(
             f"{name} holds labels from {min(labels):g} to {max(labels):g}",
-            "labels are whole numbers, and 0 is where nothing is",
+            "labels are positive integers, and 0 is the background",
         )
     if len(labels) == 1:
         raise InputError(f"{name} holds no label: all its voxels are 0", _SEGMENT_FIRST)

@@ -139,8 +139,8 @@ def corners_of(name: str, element: Element) -> tuple[Ints, Ints]:
     integer_lists = [p for p in lists if p.kind[0] != "f"]
     chosen = next((candidates for candidates in (by_name, integer_lists) if len(candidates) == 1), by_name[:1])
     if not chosen:
-        which = "none of its lists is" if not integer_lists else "it cannot be told which of its lists is"
-        raise InputError(f"{name}: {which} that of the vertices of each {element.name}", _FACE_HINT)
+        which = "none of its lists has" if not integer_lists else "it is ambiguous which of its lists has"
+        raise InputError(f"{name}: {which} the vertices of each {element.name}", _FACE_HINT)
     items, sizes = element.table[chosen[0].name]
     return indices(name, items), sizes
 

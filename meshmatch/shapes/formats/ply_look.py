@@ -43,7 +43,7 @@ def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, pictur
             raise appearance.no_coordinates(path.name)
         image_index, names = np.zeros_like(image_index), [""]
     elif names and not has_uv.any():
-        warn(f"{path.name} names the image {names[0][:200]}, but no texture coordinates by a name that is known")
+        warn(f"{path.name} names the image {names[0][:200]}, but has no texture coordinates under a known name")
     has_uv &= (image_index >= 0) & (image_index < len(names))
     if not has_uv.any():
         return appearance.vertex_colors_alone(shape)
@@ -75,7 +75,7 @@ def _image(path: Path, name: str, reader: ImageReader, shape: Shape) -> Pixels |
     missing = f"{path.name} needs the image {name[:200]}, which is not there"
     if shape.colors is None:
         raise InputError(missing, f"copy it to {path.parent}, or name another with --image")
-    warn(f"{missing}: its vertex colors are taken instead")
+    warn(f"{missing}: its vertex colors are used instead")
     return None
 
 

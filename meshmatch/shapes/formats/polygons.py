@@ -82,7 +82,7 @@ def triangles_of(
     if len(chosen) < len(concave):
         left_out = len(concave) - len(chosen)
         what = f"{left_out:,} polygons have" if left_out > 1 else "a polygon has"
-        warn(f"{name}: {what} too many corners; what is concave there is split into triangles that overlap")
+        warn(f"{name}: {what} too many corners; concave ones are split into triangles that overlap")
     return triangles
 
 

@@ -98,7 +98,7 @@ class _File:
                 raise damaged(self.name, f"it has {line[:40].decode(errors='replace')!r} where a section should begin")
         if kinds is not None:
             if len(cells) != 1 or len(cells[0].sizes) != len(kinds):
-                raise damaged(self.name, "it does not say of what kind its cells are")
+                raise damaged(self.name, "the types of its cells are missing")
             cells = [Cells(cells[0].corners, cells[0].sizes, kinds)]
         return raw_of(self.name, len(self.data), verts, cells, self._colors(len(verts)))
 
@@ -186,7 +186,7 @@ def _vertex_indices(name: str, values: NDArray[Any]) -> Ints:
     """Convert vertex indices to integers; `InputError` for fractions."""
     integers = indices(name, values)
     if values.dtype.kind == "f" and (integers != values).any():
-        raise damaged(name, "a face refers to a vertex by a number that is not whole")
+        raise damaged(name, "a face refers to a vertex by a number that is not an integer")
     return integers
 
 

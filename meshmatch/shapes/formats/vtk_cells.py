@@ -50,11 +50,9 @@ def raw_of(
         if not is_known.all():
             kind = int(each.kinds[~is_known][0])
             hint = "save its surface alone (in ParaView: Extract Surface)"
-            raise InputError(
-                f"{name} has cells of VTK's kind {kind}, which are no faces of three or more corners", hint
-            )
+            raise InputError(f"{name} has cells of VTK type {kind}, which are not faces of three or more corners", hint)
         if np.isin(each.kinds, _LINES).any():
-            warn(f"{name}: its lines are no faces, and are left out")
+            warn(f"{name}: its lines are not faces and are left out")
         starts = np.cumsum(each.sizes) - each.sizes
         for cell_types in (_POLYGONS, (_STRIP,), (_PIXEL,)):
             rows = np.flatnonzero(np.isin(each.kinds, cell_types))

@@ -206,7 +206,7 @@ class _File:
                 raise damaged(self.name, f"a piece has other than the {n_cells} cells that it promises")
             kinds = self.named(piece, group, "types") if kind is None else np.full(len(ends), kind)
             if kinds is None or len(kinds) != len(ends):
-                raise damaged(self.name, "it does not say of what kind its cells are")
+                raise damaged(self.name, "the types of its cells are missing")
             sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
             self.triangles += max(int(sizes.sum()) - 2 * n_cells, 0)
             check_element_count(self.name, self.size, self.points, self.triangles)
@@ -331,5 +331,5 @@ def _base64_length(count: int) -> int:
 def _count(name: str, piece: ElementTree.Element, key: str) -> int:
     found = str(piece.get(key, "0")).strip()
     if not (found.isascii() and found.isdigit() and len(found) < 12):
-        raise damaged(name, f"{key} is no number")
+        raise damaged(name, f"{key} is not a number")
     return int(found)
