@@ -439,12 +439,12 @@ class Document:
             if uri is None and number:
                 raise damaged(self.name, f"its buffer {number} has no data")
             self.buffers[number] = self.body if uri is None else self.resource(uri)
-            self.size += 0 if uri is None or embedded(uri) else len(self.buffers[number])
+            self.size += 0 if uri is None or is_embedded(uri) else len(self.buffers[number])
         return self.buffers[number]
 
     def resource(self, uri: str) -> bytes:
         """Return the bytes of a URI: embedded data, or a file in the folder of the glTF file."""
-        if embedded(uri):
+        if is_embedded(uri):
             try:
                 return _decode_data_uri(uri)
             except (binascii.Error, ValueError) as error:
@@ -456,7 +456,7 @@ class Document:
         return read_bytes(file)
 
 
-def embedded(uri: str) -> bool:
+def is_embedded(uri: str) -> bool:
     """Whether a URI embeds its data (`data:`)."""
     return uri[:5].lower() == "data:"
 

@@ -20,7 +20,7 @@ from meshmatch.errors import InputError
 from meshmatch.outputs import numbered_apart, plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
 from meshmatch.shapes.formats import damaged, joined_colors
-from meshmatch.shapes.formats.gltf import Document, embedded, understood
+from meshmatch.shapes.formats.gltf import Document, is_embedded, understood
 from meshmatch.shapes.shape import Shape
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -157,7 +157,7 @@ class Look:
             entry = self.json["images"][number]
             uri = entry.get("uri")
             data = self.document.view_bytes(entry["bufferView"]) if uri is None else self.document.resource(uri)
-            embedded_image = uri is None or embedded(uri)
+            embedded_image = uri is None or is_embedded(uri)
             self.images[number] = self.reader.decode(
                 data, f"image {number} of {self.document.name}" if embedded_image else uri
             )

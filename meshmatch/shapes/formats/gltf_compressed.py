@@ -64,10 +64,10 @@ def decompress(
             hint = "pip install 'meshmatch[compressed]', or export it without mesh compression"
             raise InputError(f"{name} is compressed ({extension}), which needs {library}", hint)
     views = description.setdefault("bufferViews", [])
-    packed = [view for view in views if _meshopt(view)]
+    compressed_views = [view for view in views if _meshopt(view)]
     meshes = description.get("meshes", [])
     primitives = [each for mesh in meshes for each in mesh["primitives"] if DRACO in each.get("extensions", {})]
-    streams = [_meshopt(view) for view in packed]
+    streams = [_meshopt(view) for view in compressed_views]
     distinct: dict[str, dict[str, Any]] = {}  # one primitive of each group that shares all its data
     for primitive in primitives:
         distinct.setdefault(
@@ -78,10 +78,10 @@ def decompress(
     decoded = _decode_in_subprocess(name, jobs, data) if jobs else {}
     buffers = description.setdefault("buffers", [])
     new_buffer = _Buffer(len(buffers))
-    for k, view in enumerate(packed):
+    for k, view in enumerate(compressed_views):
         view.update(new_buffer.append(decoded[f"{k}"].tobytes()))
         view.pop("extensions")
-    for k, primitive in enumerate(distinct.values(), len(packed)):
+    for k, primitive in enumerate(distinct.values(), len(compressed_views)):
         weights = [each for key, each in decoded.items() if key.startswith(f"{k} WEIGHTS_")]
         totals = np.sum([each.sum(axis=-1, keepdims=True) for each in weights], axis=0)
         for what, accessor in _accessors(description, primitive):

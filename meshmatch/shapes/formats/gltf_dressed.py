@@ -20,7 +20,7 @@ from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.colors import light
 from meshmatch.shapes.formats.gltf import COMPRESSED, Document
 from meshmatch.shapes.formats.gltf_attributes import base_color_uv, transform_of
-from meshmatch.shapes.formats.gltf_edit import Editor, drawn
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes
 from meshmatch.shapes.formats.gltf_out import VERTICES, smooth_normals
 from meshmatch.shapes.formats.gltf_prune import textures_in
 from meshmatch.shapes.formats.gltf_toon import ToonMaterials, toon_materials
@@ -58,7 +58,7 @@ def dressed(
     stored = _stored_uv(document) if own else uv  # in the file, they may lie in another tile of the image
     materials = _MaterialReplacer(editor, document, material, stored)
     n_faces = 0
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         mesh = editor.own_mesh(number)  # each node has its own region of the image
         normals = {} if material.normal is None else _normals(document, parts)
         for k, part in parts.items():
@@ -92,7 +92,7 @@ def laid(document: Document, uv: Float[Floats, "F 3 2"]) -> bytes:
     Materials are kept; vertices at seams are duplicated and appended.
     """
     editor, n_faces = Editor(document), 0
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         mesh = editor.own_mesh(number)
         for k, part in parts.items():
             V, faces = document.count(part["attributes"]["POSITION"]), document.triangles(part)
@@ -112,7 +112,7 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
         hidden = f"{len(toon)} toon materials" if toon[1:] else f"the toon material {toon[0]}"
         warn(f"programs do not show vertex colors on {hidden} of {document.name}, but they do show textures")
     n_verts = 0
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         mesh = editor.own_mesh(number)
         for k, part in parts.items():
             V = document.count(part["attributes"]["POSITION"])
@@ -127,7 +127,7 @@ def colored(document: Document, colors: Float[Floats, "V 4"], turn: Float[Floats
 
 def _stored_uv(document: Document) -> Floats:
     """First texture coordinates of everything that the scene draws, with texture transforms applied."""
-    parts = [part for parts in drawn(document).values() for part in parts.values()]
+    parts = [part for parts in drawn_nodes(document).values() for part in parts.values()]
     found = [base_color_uv(document, part) for part in parts if "TEXCOORD_0" in part["attributes"]]
     return np.concatenate([np.empty((0, 2)), *found])
 
@@ -210,7 +210,7 @@ class _MaterialReplacer:
     def __init__(self, editor: Editor, document: Document, material: BakedMaterial, uv: Floats) -> None:
         self.editor, self.baked = editor, material
         self.before = copy.deepcopy(editor.json.get("materials", []))
-        parts = [part for parts in drawn(document).values() for part in parts.values()]
+        parts = [part for parts in drawn_nodes(document).values() for part in parts.values()]
         drawn_ids = {id(part) for part in parts}
         others = (part for mesh in document.json["meshes"] for part in mesh["primitives"] if id(part) not in drawn_ids)
         # Materials of primitives that are not drawn, and those rewritten already, keep their numbers.

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import gltf_vrm
-from meshmatch.shapes.formats.gltf import INSTANCES, MAX_ORIGINS, ORIGINS, Document, digest, embedded
+from meshmatch.shapes.formats.gltf import INSTANCES, MAX_ORIGINS, ORIGINS, Document, digest, is_embedded
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS
-from meshmatch.shapes.formats.gltf_out import INDICES, TYPES, VERTICES, packed
+from meshmatch.shapes.formats.gltf_out import INDICES, TYPES, VERTICES, pack_glb
 from meshmatch.shapes.formats.gltf_prune import prune, unused
 from meshmatch.shapes.shape import Shape
 
@@ -40,7 +40,7 @@ class Editor:
         starts = []
         for k, buffer in enumerate(self.json.get("buffers", [])):
             uri = buffer.get("uri", "")
-            source = k if not uri or embedded(uri) else uri
+            source = k if not uri or is_embedded(uri) else uri
             if source not in files:
                 files[source] = self._append(document.buffer(k))
             starts.append(files[source])
@@ -52,7 +52,7 @@ class Editor:
         views: dict[str, tuple[int, str]] = {}
         for image in self.json.get("images", []):
             uri = image.get("uri")
-            if uri is not None and not embedded(uri):
+            if uri is not None and not is_embedded(uri):
                 if uri not in views:
                     data = document.resource(uri)
                     mime = next((mime for magic, mime in _IMAGES.items() if data.startswith(magic)), "image/png")
@@ -195,7 +195,7 @@ class Editor:
         """Return the glb; `OutputError` if it exceeds the size limit of a glb."""
         if self._size:
             self.json["buffers"] = [{"byteLength": self._size}]
-        return packed(self.name, self.json, self._chunks)
+        return pack_glb(self.name, self.json, self._chunks)
 
 
 def remembering(glb: bytes, of: Shape) -> bytes:
@@ -216,7 +216,7 @@ def remembering(glb: bytes, of: Shape) -> bytes:
     return editor.to_bytes()
 
 
-def drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
+def drawn_nodes(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
     """Nodes that draw something, in scene order; for each, the primitives that it draws, by their number in the mesh.
 
     `InputError` if the scene uses GPU instancing.
@@ -231,7 +231,7 @@ def drawn(document: Document) -> dict[int, dict[int, dict[str, Any]]]:
     return found
 
 
-def frames_of(document: Document, number: int, part: dict[str, Any]) -> Float[Floats, "V 3 3"]:
+def vertex_frames(document: Document, number: int, part: dict[str, Any]) -> Float[Floats, "V 3 3"]:
     """Linear maps, at each vertex of a primitive, that take directions to scene coordinates: by its skin or its node."""
     V, matrix = document.count(part["attributes"]["POSITION"]), document.world[number]
     axes = [document.to_scene(number, part, np.tile(axis, (V, 1)), matrix) for axis in np.eye(4)[:3]]

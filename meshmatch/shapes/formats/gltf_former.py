@@ -13,7 +13,7 @@ from meshmatch.arrays import Ints
 from meshmatch.errors import warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_edit import Editor, drawn
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes
 from meshmatch.shapes.formats.gltf_prune import can_edit_nodes
 from meshmatch.shapes.formats.gltf_rig import Binding
 
@@ -28,7 +28,7 @@ def hanging_groups(document: Document) -> list[tuple[Ints, Ints]]:
     """
     skeleton, unmatched, n_verts = _Influences(document), [], 0
     followers: dict[int, list[Ints]] = {}
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         V = count_vertices(document, parts)
         joint = number if number in skeleton.joints else skeleton.above.get(number)
         if joint is not None and "skin" not in document.nodes[number]:
@@ -54,7 +54,7 @@ def figures_apart(document: Document, hit: Ints) -> dict[int, str]:
     skin_of: dict[int, int] = {}
     matched_skins: set[int] = set()  # skins
     matched_roots: set[int] = set()  # roots
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         rows = slice(n_verts, n_verts := n_verts + count_vertices(document, parts))
         skin = document.nodes[number].get("skin")
         if skin is not None:
@@ -85,7 +85,7 @@ class _Influences:
 
     def __init__(self, document: Document) -> None:
         self.joints = {int(joint) for skin in document.json.get("skins", []) for joint in skin["joints"]}
-        parts = [(number, part) for number, own in drawn(document).items() for part in own.values()]
+        parts = [(number, part) for number, own in drawn_nodes(document).items() for part in own.values()]
         moved_by = np.concatenate([np.zeros(0, np.int64), *(_movers(document, *each) for each in parts)])
         self._order = np.argsort(moved_by, kind="stable")
         self._sorted = moved_by[self._order]

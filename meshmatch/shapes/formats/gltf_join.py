@@ -14,11 +14,11 @@ from meshmatch.arrays import Floats
 from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
-from meshmatch.shapes.formats.gltf_edit import Editor, drawn
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes
 from meshmatch.shapes.formats.gltf_out import VERTICES
 from meshmatch.shapes.formats.gltf_prune import references
 from meshmatch.shapes.formats.gltf_rig import Binding
-from meshmatch.shapes.formats.gltf_rigged import bake_transform, frame_of
+from meshmatch.shapes.formats.gltf_rigged import bake_transform, rigid_frame
 
 _KINDS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes")
 _VARIANTS = "KHR_materials_variants"
@@ -38,7 +38,7 @@ def joined(document: Document, added: Document, binding: Binding | None) -> byte
         without joints: the added meshes are not skinned.
     """
     editor, joints = Editor(document), joint_nodes(document)
-    parts = drawn(added)
+    parts = drawn_nodes(added)
     meshes, frames = _copy_meshes(editor, added, parts)
     joint_rows, weight_rows = (None, None) if binding is None or not joints else binding.table()
     n_verts = 0
@@ -81,7 +81,7 @@ def _copy_meshes(
     meshes = [copy.deepcopy(other.json["meshes"][added.nodes[number]["mesh"]]) for number in parts]
     frames = []
     for (number, primitives), mesh in zip(parts.items(), meshes, strict=True):
-        frame = frame_of(added, number, primitives)
+        frame = rigid_frame(added, number, primitives)
         for k, part in primitives.items() if frame is None else ():
             bake_transform(other, added, number, part, mesh["primitives"][k])
         frames.append(np.eye(4) if frame is None else frame)

@@ -19,7 +19,7 @@ from meshmatch.outputs import plain_text
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip, shape_normals
 from meshmatch.shapes.formats import check_element_count, gltf_vrm
 from meshmatch.shapes.formats.gltf import Document, understood
-from meshmatch.shapes.formats.gltf_edit import Editor, drawn, frames_of
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes, vertex_frames
 from meshmatch.shapes.shape import Shape
 
 _BASE_WEIGHTS = 3_500_000
@@ -43,7 +43,7 @@ def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Floa
     moving: dict[int, Floats] = {}
     animated, replaced = _weight_channels(document), set(added.names)
     n_verts = 0
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         start, n_verts = (
             n_verts,
             n_verts + sum(document.count(part["attributes"]["POSITION"]) for part in parts.values()),
@@ -224,7 +224,7 @@ def _add_targets(
     ``moves`` are the displacements of its vertices in scene coordinates; ``normals`` the scene normals at rest, followed by
     those with each blendshape at weight 1, or None for targets without normals.
     """
-    frames = frames_of(document, number, primitive)
+    frames = vertex_frames(document, number, primitive)
     to_local, stored = np.linalg.pinv(frames), np.empty((0, 3))
     if normals is not None:
         stored = unit(document.accessor(primitive["attributes"]["NORMAL"]))

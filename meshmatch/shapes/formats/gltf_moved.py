@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import edge_lengths, edges_of, unit
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_edit import Editor, drawn, frames_of
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes, vertex_frames
 from meshmatch.shapes.formats.gltf_out import VERTICES
 
 
@@ -32,7 +32,7 @@ def moved(document: Document, verts: Float[Floats, "V 3"], turns: Float[Floats, 
     """
     editor = Editor(document)
     first = 0
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         mesh = editor.own_mesh(number)
         for k, part in parts.items():
             rows = slice(first, first + document.count(part["attributes"]["POSITION"]))
@@ -53,7 +53,7 @@ def _move(
 ) -> None:
     """Store a primitive with new positions, and rotate its normals, tangents and morph targets."""
     matrix = document.world[number]
-    before, frames = document.scene_positions(number, part, matrix), frames_of(document, number, part)
+    before, frames = document.scene_positions(number, part, matrix), vertex_frames(document, number, part)
     origin = document.to_scene(number, part, np.tile([0.0, 0.0, 0.0, 1.0], (len(verts), 1)), matrix)
     to_local = np.linalg.pinv(frames)
     unmoved = np.asarray(~np.isfinite(verts).all(axis=1))

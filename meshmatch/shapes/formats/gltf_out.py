@@ -154,10 +154,10 @@ def _glb(
         sampler = {"input": n_vertex_arrays, "output": n_vertex_arrays + 1, "interpolation": "LINEAR"}
         document["animations"] = [{"name": name or "sequence", "channels": [channel], "samplers": [sampler]}]
     document |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
-    return packed(name, document, padded)
+    return pack_glb(name, document, padded)
 
 
-def packed(name: str, document: dict[str, Any], chunks: Sequence[bytes]) -> bytes:
+def pack_glb(name: str, document: dict[str, Any], chunks: Sequence[bytes]) -> bytes:
     """Assemble a glb from its JSON description and the chunks of its only buffer, each a multiple of four bytes long.
 
     `OutputError` if it exceeds the size limit of a glb.

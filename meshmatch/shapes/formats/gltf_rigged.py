@@ -14,7 +14,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import warn
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_edit import Editor, drawn
+from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes
 from meshmatch.shapes.formats.gltf_former import count_vertices, reattach_children, warn_of_detached
 from meshmatch.shapes.formats.gltf_out import VERTICES
 from meshmatch.shapes.formats.gltf_prune import can_edit_nodes, drop_nodes
@@ -47,12 +47,12 @@ def rigged(document: Document, binding: Binding, apart: Container[int] = ()) -> 
     skins: dict[bytes, int] = {}
     former_skins: set[int] = set()
     n_verts = 0
-    for number, parts in drawn(document).items():
+    for number, parts in drawn_nodes(document).items():
         if number in apart:
             n_verts += count_vertices(document, parts)
             continue
         node = editor.json["nodes"][number]
-        frame = frame_of(document, number, parts)
+        frame = rigid_frame(document, number, parts)
         mesh = editor.own_mesh(number)  # each node gets its own weights
         for k, part in parts.items():
             primitive = mesh["primitives"][k]
@@ -78,7 +78,7 @@ def rigged(document: Document, binding: Binding, apart: Container[int] = ()) -> 
             former_skins.add(node["skin"])
         node["skin"] = skins[to_scene.tobytes()]
     former_joints, clips = _drop_skins(editor, former_skins)
-    _move_to_root(editor, document, {number for number in drawn(document) if number not in apart})
+    _move_to_root(editor, document, {number for number in drawn_nodes(document) if number not in apart})
     arrays: dict[bytes, int] = {}
     own_clips: dict[str, list[dict[str, Any]]] = {}
     for animation in reversed(editor.json.get("animations", [])):
@@ -110,7 +110,7 @@ def _add_nodes(editor: Editor, document: Document, rig: Rig) -> list[int]:
     return node_numbers
 
 
-def frame_of(document: Document, number: int, parts: dict[int, dict[str, Any]]) -> Float[Floats, "4 4"] | None:
+def rigid_frame(document: Document, number: int, parts: dict[int, dict[str, Any]]) -> Float[Floats, "4 4"] | None:
     """Return the matrix that takes the vertices of a node to scene coordinates.
 
     None if a skin deforms them (no single matrix does) or if they are mirrored: viewers disagree on which side of a

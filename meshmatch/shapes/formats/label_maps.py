@@ -287,9 +287,7 @@ def _unpacker(name: str, encoding: str, content: bytes, kind: str) -> Callable[[
         return lambda need: _decompress(content, need, "gzip" if encoding[0] == "g" else "bz2")
     if encoding in ("ascii", "text", "txt"):
         return lambda need: parse_numbers(name, content).astype(kind).tobytes()[:need]
-    raise InputError(
-        f"{name} has the unsupported encoding {encoding[:20]}", "save it uncompressed, or by gzip"
-    )
+    raise InputError(f"{name} has the unsupported encoding {encoding[:20]}", "save it uncompressed, or by gzip")
 
 
 _READERS: dict[str, Callable[[Path, bytes], _LabelMap]] = {

@@ -43,7 +43,7 @@ def read(path: Path, data: bytes) -> Raw:
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
     check_text(name, data)
-    data = joined_lines(data)
+    data = join_lines(data)
     text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, data, b"v")
     formats.check_element_count(
         name, len(data), len(vertex_lines), max(int(sizes.sum()) - 2 * len(sizes), 0), text=True
@@ -72,10 +72,10 @@ def vertices_of_corners(
         raise damaged(name, "a corner of a face has no vertex before its slash")
     if (corners == 0).any():
         raise damaged(name, "a face refers to vertex 0, but obj files count from 1")
-    return from_one(name, "vertex", corners, vertex_lines, np.repeat(face_lines, sizes)) - 1
+    return resolve_indices(name, "vertex", corners, vertex_lines, np.repeat(face_lines, sizes)) - 1
 
 
-def joined_lines(data: bytes) -> bytes:
+def join_lines(data: bytes) -> bytes:
     r"""Normalize line ends to \n and join lines that are continued by a backslash.
 
     A comment is not continued, even if it ends in a backslash, as a path may. A line that begins with the keyword of an
@@ -161,7 +161,7 @@ def entries_and_faces(name: str, data: bytes, word: bytes) -> tuple[bytes, Ints,
     return text, entry_lines, faces, sizes, face_lines
 
 
-def from_one(
+def resolve_indices(
     name: str, what: str, values: Float[Floats, " N"], entry_lines: Int[Ints, " M"], lines: Int[Ints, " N"]
 ) -> Int[Ints, " N"]:
     """Resolve indices of faces to positive 1-based ones; negative ones count back from the last entry before their line.

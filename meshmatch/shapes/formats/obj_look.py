@@ -20,7 +20,7 @@ from meshmatch.shapes.appearance import Alpha, Appearance, Finish, ImageReader, 
 from meshmatch.shapes.colors import to_linear
 from meshmatch.shapes.companions import beside, folded
 from meshmatch.shapes.formats import DECIMAL_COMMA, columns, damaged, lines_starting_with, parse_numbers, words_per_line
-from meshmatch.shapes.formats.obj import entries_and_faces, from_one, joined_lines, vertices_of_corners
+from meshmatch.shapes.formats.obj import entries_and_faces, join_lines, resolve_indices, vertices_of_corners
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
@@ -86,7 +86,7 @@ class _Entry:
 
 def read_look(path: Path, data: bytes, shape: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Read materials and texture coordinates per face, in the order of `obj.read`; `picture` replaces all images."""
-    faces = _face_materials(path, joined_lines(data), shape, picture is None)
+    faces = _face_materials(path, join_lines(data), shape, picture is None)
     corners, face_has_uv, material_index = faces.corners, faces.face_has_uv, faces.material_index
     materials: list[Material] = []
     scale, offset = np.ones((len(faces.entries), 2)), np.zeros((len(faces.entries), 2))
@@ -114,7 +114,7 @@ def read_finish(path: Path, data: bytes, shape: Shape, reader: ImageReader) -> F
     These are ``Pr``, ``Pm``, ``Ke`` and their maps, and a normal map (``norm`` or ``map_Bump``). An image that cannot be
     read is left out, with a warning. None if no material has any of these.
     """
-    faces = _face_materials(path, joined_lines(data), shape, True)
+    faces = _face_materials(path, join_lines(data), shape, True)
     if not any(entry.numbers or entry.maps for _, entry, _ in faces.entries):
         return None
     corners = faces.corners
@@ -233,7 +233,7 @@ def _by_tile(faces: _FaceMaterials) -> _FaceMaterials:
 
 def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 3 2"] | None:
     """Read texture coordinates of all faces, v down; None if any face has none. `shape` is read from the same file."""
-    uv, face_has_uv, _ = _coordinates(path.name, joined_lines(data), shape)
+    uv, face_has_uv, _ = _coordinates(path.name, join_lines(data), shape)
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return uv if face_has_uv.all() else None
 
@@ -245,7 +245,7 @@ def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
     """
     found: dict[Path, None] = {}
     missing: dict[str, None] = {}
-    [libraries] = lines_starting_with(joined_lines(data), b"mtllib")
+    [libraries] = lines_starting_with(join_lines(data), b"mtllib")
     for name, _ in _words(*libraries):
         file_with_spaces = beside(path.parent, name)
         files = [file_with_spaces] if file_with_spaces is not None else _library_files(path.parent, _uncommented(name))
@@ -253,7 +253,7 @@ def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
             missing[name] = None
         found |= dict.fromkeys(file for file in files if file is not None)
     for library in list(found):
-        text = joined_lines(read_bytes(library, largest=_MAX_MTL_BYTES)).decode("utf-8", "surrogateescape")
+        text = join_lines(read_bytes(library, largest=_MAX_MTL_BYTES)).decode("utf-8", "surrogateescape")
         for rest in _MAP_LINE.findall(text):
             try:
                 name = _parse_map(rest.strip()).file
@@ -298,7 +298,7 @@ def _coordinates(name: str, data: bytes, shape: Shape) -> tuple[Floats, Bools, I
     index = np.zeros(int(sizes.sum()), np.int64)
     if b"/" in faces:
         values = parse_numbers(name, second_index(faces))
-        index = from_one(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
+        index = resolve_indices(name, "texture coordinate", values, vt_lines, np.repeat(face_lines, sizes))
     vertices = index
     if (sizes > 3).any():  # the triangulation of polygons depends on their vertices
         [(_, v_lines)] = lines_starting_with(data, b"v")
@@ -365,7 +365,7 @@ def _parse(file: Path) -> dict[str, _Entry]:
     """Parse an mtl file; `InputError` for a malformed color, opacity or color map."""
     entries: dict[str, _Entry] = {}
     entry = _Entry()
-    data = joined_lines(read_bytes(file, largest=_MAX_MTL_BYTES))
+    data = join_lines(read_bytes(file, largest=_MAX_MTL_BYTES))
     for line in data.decode("utf-8", "surrogateescape").split("\n"):
         word, rest = (*line.split(None, 1), "", "")[:2]
         word, rest = word.lower(), rest.strip()

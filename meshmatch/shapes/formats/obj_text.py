@@ -16,7 +16,13 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import unit
 from meshmatch.shapes.formats import columns, lines_starting_with, parse_numbers, without_comments, words_per_line
-from meshmatch.shapes.formats.obj import SPACED_SLASH, entries_and_faces, from_one, joined_lines, vertices_of_corners
+from meshmatch.shapes.formats.obj import (
+    SPACED_SLASH,
+    entries_and_faces,
+    join_lines,
+    resolve_indices,
+    vertices_of_corners,
+)
 from meshmatch.shapes.formats.polygons import triangles_of
 
 _GAP = rb"[ \t]++"
@@ -61,7 +67,7 @@ def with_positions(
     InputError
         The text does not have V lines of vertices.
     """
-    joined = joined_lines(data)
+    joined = join_lines(data)
     if joined.replace(b"\n", b"") != data.replace(b"\r", b"").replace(b"\n", b"") or b"\n" not in data:
         data = joined  # it has continued lines, or lines that end in a lone carriage return
     new_text = _replace_numbers(data, b"v", verts, "%.12g")
@@ -88,7 +94,7 @@ class Polygons:
 
 def polygons_of(name: str, data: bytes, verts: Float[Floats, "V 3"]) -> Polygons:
     """Return the polygons of an obj; `verts` are its V vertices as read by `obj.read`."""
-    _, vertex_lines, faces, sizes, face_lines = entries_and_faces(name, joined_lines(data), b"v")
+    _, vertex_lines, faces, sizes, face_lines = entries_and_faces(name, join_lines(data), b"v")
     corners = vertices_of_corners(name, faces, sizes, vertex_lines, face_lines)
     return Polygons(sizes, triangles_of(name, verts, corners, sizes))
 
@@ -107,7 +113,7 @@ def with_material(data: bytes, library: str, material: str, uv: Float[Floats, "N
     uv
         New texture coordinates of each face corner, v up, which replace the old ones; None to keep the old ones.
     """
-    lines = joined_lines(data).split(b"\n")
+    lines = join_lines(data).split(b"\n")
     words = [line.split(None, 1)[:1] for line in lines]
     keywords = [word[0] if word else b"" for word in words]
     # in the order of `entries_and_faces`
@@ -141,7 +147,7 @@ def with_colors(name: str, data: bytes, colors: Float[Floats, "V 4"]) -> bytes:
         return found[0] if k >= len(colors) else b"%b %.6g %.6g %.6g" % (found[1], *rows[k])
 
     rows = colors[:, :3].tolist()
-    text = _VERTEX.sub(with_color, joined_lines(data))
+    text = _VERTEX.sub(with_color, join_lines(data))
     if next(number) != len(colors):
         raise InputError(f"cannot tell the vertices of {name} apart", "export it again, one 'v' line for each")
     return text
@@ -149,7 +155,7 @@ def with_colors(name: str, data: bytes, colors: Float[Floats, "V 4"]) -> bytes:
 
 def beyond_triangles(name: str, data: bytes) -> list[str]:
     """Kinds of content besides the triangles of one mesh with one material, in words ("polygons", "groups", ...)."""
-    data = joined_lines(data)
+    data = join_lines(data)
     normals, _, sizes = entries_and_faces(name, data, b"vn")[1:4]
     groups, objects, materials = lines_starting_with(without_comments(data), b"g", b"o", b"usemtl")
     present = {
@@ -204,7 +210,7 @@ def _turned_normals(name: str, data: bytes, turns: Float[Floats, "V 3 3"]) -> Fl
     normals = columns(parse_numbers(name, text), counts, 0, 3)
     vertex_lines = entries_and_faces(name, data, b"v")[1]
     vertices = vertices_of_corners(name, faces, sizes, vertex_lines, face_lines)
-    normal_of_corner: Ints = from_one(
+    normal_of_corner: Ints = resolve_indices(
         name,
         "normal",
         parse_numbers(name, _UP_TO_NORMAL.sub(b"", _WITHOUT_NORMAL.sub(b"0", faces))),

@@ -70,7 +70,7 @@ def read(path: Path, data: bytes) -> Raw:
     colors = _colors(content.vertices)
     lists = [corners_of(name, each) for each in content.faces]
     faces = [corners[triangles_of(name, verts, corners, sizes)] for corners, sizes in lists]
-    faces += [faces_of(*corners_of(name, each)) for each in content.strips]
+    faces += [strip_triangles(*corners_of(name, each)) for each in content.strips]
     triangles = np.concatenate([NO_FACES, *faces])
     for skipped in content.unread:
         warn(f"{name}: its {skipped.count} {skipped.name} are not read; faces should be an element face")
@@ -281,7 +281,7 @@ def _check_kinds(name: str, element: Element) -> None:
             raise damaged(name, f"its header declares {p.name} of the element {element.name} as {what}")
 
 
-def faces_of(corners: Ints, sizes: Ints) -> Ints:
+def strip_triangles(corners: Ints, sizes: Ints) -> Ints:
     """Triangles of strips; a row may contain several strips, separated by -1."""
     is_separator = corners < 0
     strip_of = np.repeat(np.arange(len(sizes)), sizes) + np.cumsum(is_separator)

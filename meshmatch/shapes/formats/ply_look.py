@@ -18,7 +18,7 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader, Material, Pixels
 from meshmatch.shapes.companions import beside
 from meshmatch.shapes.formats import damaged
-from meshmatch.shapes.formats.ply import Content, corners_of, faces_of, parsed
+from meshmatch.shapes.formats.ply import Content, corners_of, parsed, strip_triangles
 from meshmatch.shapes.formats.ply_rows import Element
 from meshmatch.shapes.formats.polygons import triangles_of
 from meshmatch.shapes.shape import Shape
@@ -102,7 +102,7 @@ def _coordinates(name: str, content: Content, shape: Shape) -> tuple[Floats, Boo
         )
         image_indices.append(image_index[polygon])
     for strip in content.strips:
-        triangles = faces_of(*corners_of(name, strip))
+        triangles = strip_triangles(*corners_of(name, strip))
         uvs.append(_uv_of_faces(vertex_uv, triangles))
         has_uv.append(np.full(len(triangles), vertex_uv is not None))
         image_indices.append(np.zeros(len(triangles), np.int64))

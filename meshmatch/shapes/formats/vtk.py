@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Floats, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.formats import WRONG_SUFFIX, Raw, check_element_count, damaged, indices, parse_numbers
-from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
+from meshmatch.shapes.formats.vtk_cells import Cells, build_raw
 from meshmatch.shapes.shape import Shape
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -100,7 +100,7 @@ class _File:
             if len(cells) != 1 or len(cells[0].sizes) != len(kinds):
                 raise damaged(self.name, "the types of its cells are missing")
             cells = [Cells(cells[0].corners, cells[0].sizes, kinds)]
-        return raw_of(self.name, len(self.data), verts, cells, self._colors(len(verts)))
+        return build_raw(self.name, len(self.data), verts, cells, self._colors(len(verts)))
 
     def _cells(self, count: int, size: int) -> tuple[Ints, Ints]:
         """Read cells: the points of all cells, concatenated, and the number of points of each."""

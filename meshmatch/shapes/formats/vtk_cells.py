@@ -32,7 +32,7 @@ class Cells:
         return replace(self, corners=np.where(is_valid, self.corners + first, -1))
 
 
-def raw_of(
+def build_raw(
     name: str, size: int, verts: Float[Floats, "V 3"], cells: Sequence[Cells], colors: Float[Floats, "V 4"] | None
 ) -> Raw:
     """Build the `Raw` of a file of `size` bytes; `InputError` for cells that are not faces, or inconsistent counts.

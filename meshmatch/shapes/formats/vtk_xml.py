@@ -33,7 +33,7 @@ from meshmatch.shapes.formats import (
     painted,
     parse_numbers,
 )
-from meshmatch.shapes.formats.vtk_cells import Cells, raw_of
+from meshmatch.shapes.formats.vtk_cells import Cells, build_raw
 from meshmatch.shapes.input_files import read_bytes
 
 SUFFIXES = (".vtp", ".vtu")
@@ -63,7 +63,7 @@ class Surface:
     sizes: Int[Ints, " P"] | None
 
 
-def surface_of(name: str, data: bytes) -> Surface | None:
+def read_surface(name: str, data: bytes) -> Surface | None:
     """Read the points and polygon sizes of a file; None if it has several pieces, or is not PolyData."""
     file = _File(name, data)
     pieces = file.root.findall("./*/Piece")
@@ -80,7 +80,7 @@ def surface_of(name: str, data: bytes) -> Surface | None:
     return None if ends is None else Surface(verts, np.diff(np.concatenate([[0], ends.astype(np.int64)])))
 
 
-def element_like(head: bytes, name: str, values: NDArray[Any]) -> str:
+def format_array(head: bytes, name: str, values: NDArray[Any]) -> str:
     """Format an array (V, D) as an XML element, with the byte order and compressor that the file header `head` declares."""
     begin = re.search(rb"<VTKFile\b[^>]*>", head)
     attributes = {} if begin is None else ElementTree.fromstring(begin[0].rstrip(b"/>") + b"/>").attrib
@@ -104,7 +104,7 @@ def element_like(head: bytes, name: str, values: NDArray[Any]) -> str:
     return f'{start_tag}"binary">{encoded.decode()}</DataArray>\n'
 
 
-def arrays_of(name: str, data: bytes) -> list[str]:
+def array_names(name: str, data: bytes) -> list[str]:
     """Names of the point and cell arrays of a file, without colors and normals."""
     root = _File(name, data).root
     found = [each for group in ("PointData", "CellData") for each in root.findall(f"./*/Piece/{group}/DataArray")]
@@ -169,7 +169,7 @@ class _File:
             cells += [each.moved(first, count) for each in self._cells(piece)]
             first += count
         vertex_colors = joined_colors(colors, counts) if pieces else None
-        return raw_of(self.name, self.size, np.concatenate(verts), cells, vertex_colors)
+        return build_raw(self.name, self.size, np.concatenate(verts), cells, vertex_colors)
 
     def point_arrays(self) -> dict[str, NDArray[Any]]:
         parts = [self._piece_point_arrays(piece) for piece in self.root.findall("./*/Piece")]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from meshmatch.errors import warn
 from meshmatch.shapes.formats.polygons import majority_of_triangles
 from meshmatch.shapes.formats.vtk import Arrays, to_vtk_types, xml_comment
-from meshmatch.shapes.formats.vtk_xml import APPENDED, Surface, arrays_of, element_like, surface_of
+from meshmatch.shapes.formats.vtk_xml import APPENDED, Surface, array_names, format_array, read_surface
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -51,7 +51,7 @@ class VtpFile:
     @classmethod
     def parsed(cls, name: str, data: bytes) -> VtpFile:
         """Parse the bytes of a file."""
-        return cls(name, data, surface_of(name, data))
+        return cls(name, data, read_surface(name, data))
 
     @classmethod
     def of(cls, file: Path | None, shape: Shape, faces: bool = False) -> VtpFile | None:
@@ -73,7 +73,7 @@ class VtpFile:
     @property
     def arrays(self) -> list[str]:
         """Names of its point and cell arrays, without colors and normals."""
-        return arrays_of(self.name, self.data)
+        return array_names(self.name, self.data)
 
     @property
     def beyond_triangles(self) -> list[str]:
@@ -169,7 +169,7 @@ def _add_arrays(name: str, head: bytes, group: bytes, arrays: dict[str, NDArray[
     offsets = _Offsets.of(head)
     # readers show the first array of colors, so new colors come first
     colors, others = (
-        "".join(element_like(head, label, each) for label, each in arrays.items() if (each.dtype == np.uint8) == first)
+        "".join(format_array(head, label, each) for label, each in arrays.items() if (each.dtype == np.uint8) == first)
         for first in (True, False)
     )
     first, last = (each.encode("ascii", "xmlcharrefreplace") for each in (colors, others))
