@@ -98,7 +98,7 @@ class _File:
                 raise damaged(self.name, f"it has {line[:40].decode(errors='replace')!r} where a section should begin")
         if kinds is not None:
             if len(cells) != 1 or len(cells[0].sizes) != len(kinds):
-                raise damaged(self.name, "the types of its cells are missing")
+                raise damaged(self.name, "the types of its cells are missing or incomplete")
             cells = [Cells(cells[0].corners, cells[0].sizes, kinds)]
         return build_raw(self.name, len(self.data), verts, cells, self._colors(len(verts)))
 

@@ -206,7 +206,7 @@ class _File:
                 raise damaged(self.name, f"a piece has other than the {n_cells} cells that it promises")
             kinds = self.named(piece, group, "types") if kind is None else np.full(len(ends), kind)
             if kinds is None or len(kinds) != len(ends):
-                raise damaged(self.name, "the types of its cells are missing")
+                raise damaged(self.name, "the types of its cells are missing or incomplete")
             sizes = np.diff(np.concatenate([[0], ends.astype(np.int64)]))
             self.triangles += max(int(sizes.sum()) - 2 * n_cells, 0)
             check_element_count(self.name, self.size, self.points, self.triangles)
