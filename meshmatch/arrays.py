@@ -61,22 +61,22 @@ def as_read_only(values: Any, dtype: type, label: str) -> NDArray[Any]:
         shared: NDArray[Any] = values
         return shared
     try:
-        values = off_torch(values)
+        values = to_numpy(values)
         if np.iscomplexobj(values):
             raise TypeError("complex numbers are not supported")
         array: NDArray[Any] = np.array(values, dtype=dtype, order="C")
     except (TypeError, ValueError) as error:
         raise InputError(f"{label}: not an array of numbers ({error})") from error
-    return frozen(array)
+    return set_read_only(array)
 
 
-def frozen(array: NDArray[Any]) -> NDArray[Any]:
+def set_read_only(array: NDArray[Any]) -> NDArray[Any]:
     """Make an array read-only and return it."""
     array.setflags(write=False)
     return array
 
 
-class Pickled:
+class PickledFields:
     """Mixin for frozen dataclasses that pickles their fields alone, without cached values.
 
     Arrays that were read-only are read-only again.
@@ -90,10 +90,10 @@ class Pickled:
     def __setstate__(self, state: tuple[dict[str, Any], tuple[str, ...]]) -> None:
         self.__dict__.update(state[0])
         for name in state[1]:
-            frozen(state[0][name])
+            set_read_only(state[0][name])
 
 
-class Brief:
+class ShortRepr:
     """Mixin for dataclasses with ``repr=False``: a one-line repr that gives arrays by their sizes."""
 
     def __repr__(self) -> str:
@@ -116,14 +116,14 @@ def table_html(title: str, rows: Mapping[str, str]) -> str:
     return f"<b>{escape(title)}</b><table>{''.join(lines)}</table>"
 
 
-def off_torch(values: Any) -> Any:
+def to_numpy(values: Any) -> Any:
     """Convert a torch tensor, or a list of them, to NumPy, detached and in CPU memory; return anything else as is.
 
     `TypeError` for a tensor that is not dense or not of numbers, such as a sparse one.
     """
     if isinstance(values, list | tuple):
         are_tensors = len(values) > 0 and is_tensor(values[0])
-        return [off_torch(each) for each in values] if are_tensors else values
+        return [to_numpy(each) for each in values] if are_tensors else values
     if not is_tensor(values):
         return values
     try:
@@ -143,13 +143,13 @@ def is_tensor(values: Any) -> bool:
 def as_array(values: Any, name: str, hint: str = "") -> NDArray[Any]:
     """The values as an array of any type; `InputError` if they do not form one, such as rows of different lengths."""
     try:
-        return np.asarray(off_torch(values))
+        return np.asarray(to_numpy(values))
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: not an array ({error})", hint) from error
 
 
 @np.errstate(invalid="ignore")  # rounding nan; nan is refused
-def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
+def as_integers(values: ArrayLike, label: str) -> Int[Ints, ...]:
     """Convert integers, which may be given as floats, to int64; `InputError` for anything else."""
     array = as_array(values, label)
     is_whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
@@ -163,7 +163,7 @@ def whole_numbers(values: ArrayLike, label: str) -> Int[Ints, ...]:
 def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) -> Floats:
     """Convert values to float64; `InputError` if they are not numbers, rows differ in length, or ``finite`` fails."""
     try:
-        array = np.asarray(off_torch(values))
+        array = np.asarray(to_numpy(values))
         if array.dtype.kind == "c":
             raise TypeError("complex numbers are not supported")
         array = array.astype(np.float64, copy=False)

@@ -70,7 +70,7 @@ def command(name: str) -> list[str]:
     return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
 
 
-def glb_of(path: Path) -> bytes:
+def convert_to_glb(path: Path) -> bytes:
     """Convert a file to glb: in meters, y up, with materials, skeletons, clips and morph targets.
 
     `InputError` if Blender cannot read it, `OptionError` if there is no Blender.
@@ -79,7 +79,7 @@ def glb_of(path: Path) -> bytes:
 
 
 def has_polygons(path: Path) -> bool:
-    """Whether a file has faces with more than three corners, which its glb has as triangles; errors as for `glb_of`."""
+    """Whether a file has faces with more than three corners (triangles in its glb); errors as for `convert_to_glb`."""
     return _convert(path)[1]
 
 

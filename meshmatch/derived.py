@@ -11,7 +11,7 @@ from functools import wraps
 from threading import RLock
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from meshmatch.gathering import unbatched
+from meshmatch.batching import unbatched
 
 Owner = TypeVar("Owner")
 P = ParamSpec("P")
@@ -43,7 +43,7 @@ def derived(derive: Callable[Concatenate[Owner, P], Value]) -> Callable[Concaten
     return wrapper
 
 
-def remember(function: Callable[[Owner], Value], owner: Owner, value: Value) -> None:
+def store_derived(function: Callable[[Owner], Value], owner: Owner, value: Value) -> None:
     """Store the value that a `derived` function would compute for an object."""
     _store_of(owner).values[function.__wrapped__, (), ()] = value  # type: ignore[attr-defined]
 

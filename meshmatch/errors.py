@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-LONGEST = 300
+MAX_MESSAGE_LENGTH = 300
 """Maximum length of a message or a hint, in characters; longer ones are elided in the middle."""
 _INVISIBLE = dict.fromkeys(
     (*range(32), *range(127, 160), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
@@ -91,7 +91,7 @@ def visible(text: str) -> str:
 
 def _line(text: str) -> str:
     line = visible(" ".join(str(text).split()))
-    return line if len(line) <= LONGEST else f"{line[: LONGEST - 103]}...{line[-100:]}"
+    return line if len(line) <= MAX_MESSAGE_LENGTH else f"{line[: MAX_MESSAGE_LENGTH - 103]}...{line[-100:]}"
 
 
 @contextmanager

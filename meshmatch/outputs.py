@@ -20,7 +20,7 @@ def plain_text(text: str) -> str:
     return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
-def numbered_apart(words: Iterable[str], between: str, alike: Callable[[str], str] = str) -> list[str]:
+def make_unique(words: Iterable[str], between: str, alike: Callable[[str], str] = str) -> list[str]:
     """The words, made unique: repetitions get the suffixes 2, 3, ... after ``between``.
 
     Words are repetitions if ``alike`` maps them to the same string.
@@ -164,7 +164,7 @@ def replace_all_on_success(paths: Sequence[str | Path]) -> Iterator[list[Path]]:
         yield [claims.enter_context(replace_on_success(path)) for path in paths]
 
 
-def sweep(folder: Path) -> None:
+def remove_leftovers(folder: Path) -> None:
     """Remove temporary files that `replace_on_success` left in a folder, or below it, when its process was killed.
 
     No other process may be writing there.

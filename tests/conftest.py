@@ -40,7 +40,7 @@ def kept_glb() -> Iterator[None]:
     if not (named := os.environ.get("MESHMATCH_KEEP_GLB")):
         yield
         return
-    from meshmatch.shapes.formats import gltf_edit, gltf_out
+    from meshmatch.shapes.formats import gltf_edit, gltf_write
 
     folder = Path(named)
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def kept_glb() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gltf_edit.Editor, "to_bytes", keeping(gltf_edit.Editor.to_bytes))
-        patch.setattr(gltf_out, "_glb", keeping(gltf_out._glb))
+        patch.setattr(gltf_write, "_glb", keeping(gltf_write._glb))
         yield
 
 

@@ -12,7 +12,7 @@ import pytest
 import meshmatch
 from meshmatch import blender
 from meshmatch.cli import main
-from meshmatch.shapes.formats import gltf_out
+from meshmatch.shapes.formats import gltf_write
 from tests.blender_at_hand import needs_blender, run_inside
 from tests.transfer.rigs import tube
 
@@ -177,7 +177,7 @@ def test_another_suffix_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
 @needs_blender
 def test_the_extension_works_in_blender(extension: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BLENDER_USER_RESOURCES", str(tmp_path / "user"))
-    (tmp_path / "tube.glb").write_bytes(gltf_out.glb_of(tube()))
+    (tmp_path / "tube.glb").write_bytes(gltf_write.glb_of(tube()))
     program = tmp_path / "meshmatch"
     program.write_text(f"#!{sys.executable}{PROGRAM}".replace("COUNT", str(tube().V)))
     program.chmod(0o755)
@@ -224,7 +224,7 @@ sys.stdout.flush()
 os._exit(0)
 """
     (tmp_path / "script.py").write_text(script)
-    (tmp_path / "tube.glb").write_bytes(gltf_out.glb_of(tube()))
+    (tmp_path / "tube.glb").write_bytes(gltf_write.glb_of(tube()))
     run_inside(tmp_path / "script.py", tmp_path / "tube.glb", tmp_path / "tube.ply")
     x, y, z = tube().verts.T
     np.testing.assert_allclose(meshmatch.load_shape(tmp_path / "tube.ply").verts, np.stack([x, -z, y], 1), atol=1e-5)

@@ -7,7 +7,7 @@ import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 
-from meshmatch.derived import derived, remember
+from meshmatch.derived import derived, store_derived
 from meshmatch.shapes.shape import Shape
 
 
@@ -53,7 +53,7 @@ def test_what_is_known_is_not_computed(cube: Shape) -> None:
     def never(shape: Shape) -> int:
         raise AssertionError
 
-    remember(never, own := copy_of(cube), 3)
+    store_derived(never, own := copy_of(cube), 3)
     assert never(own) == 3
 
 

@@ -14,19 +14,19 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import turn_upright
-from meshmatch.arrays import Brief
+from meshmatch.arrays import ShortRepr
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import shortest_turns
-from meshmatch.outputs import as_path, check_new_folder, folder_on_success, numbered_apart, replace_on_success
+from meshmatch.geometry.triangles import rotations_between
+from meshmatch.outputs import as_path, check_new_folder, folder_on_success, make_unique, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.blend_shape_files import load_blend_shapes, save_blend_shapes
 from meshmatch.shapes.blend_shapes import BlendShapes, shape_normals
-from meshmatch.shapes.files import ShapeLike, as_scene, as_shape
+from meshmatch.shapes.deformed_files import MovedFile, add_appearance, warn_about_lost
+from meshmatch.shapes.files import ShapeLike, as_gltf_scene, as_shape
 from meshmatch.shapes.formats import gltf
-from meshmatch.shapes.formats.gltf_edit import remembering
+from meshmatch.shapes.formats.gltf_edit import record_source_mesh
 from meshmatch.shapes.formats.gltf_morphs import with_morphs
 from meshmatch.shapes.formats.gltf_vrm import check_character
-from meshmatch.shapes.moved_files import MovedFile, tell_left, with_look
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.blend_shapes import carry_moves
@@ -37,7 +37,7 @@ _MAX_NAME_LENGTH = 100  # characters of a file's name
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class BlendShapesResult(Brief):
+class BlendShapesResult(ShortRepr):
     """The blendshapes of the source on the target: the result of `transfer_shapes`.
 
     Attributes
@@ -113,15 +113,15 @@ class BlendShapesResult(Brief):
     def _plans(self, folder: Path) -> list[MovedFile]:
         """Plan the files of a folder of meshes: an .obj for each blendshape, and their common materials and images."""
         safe_names = (_UNSAFE.sub("_", name)[:_MAX_NAME_LENGTH].strip(". ") or "shape" for name in self.shapes.names)
-        files = [folder / f"{stem}.obj" for stem in numbered_apart(safe_names, "-", str.lower)]
-        return MovedFile.planned_all(files, self.original)
+        files = [folder / f"{stem}.obj" for stem in make_unique(safe_names, "-", str.lower)]
+        return MovedFile.plan_all(files, self.original)
 
     def _write_meshes(self, plans: Sequence[MovedFile]) -> None:
         normals = shape_normals(self.target, self.shapes.moves)
         for move, plan, now in zip(self.shapes.moves, plans, normals[1:], strict=True):
             shape = replace(self.target, verts=self.target.verts + move)
             plan.make_folders()
-            plan.write(plan.files, shape, shortest_turns(normals[0], now))
+            plan.write(plan.files, shape, rotations_between(normals[0], now))
 
 
 def write_shapes(result: BlendShapesResult, output: Path, place: Path) -> None:
@@ -130,12 +130,12 @@ def write_shapes(result: BlendShapesResult, output: Path, place: Path) -> None:
         save_blend_shapes(place, result.shapes)
         return
     target, original = result.target, result.original
-    path, data, in_gltf = as_scene(original or target, target)
+    path, data, in_gltf = as_gltf_scene(original or target, target)
     turn = np.eye(3) if in_gltf else turn_upright(result.maps, result.stands_along_y)
     adding = partial(with_morphs, shape=target, added=result.shapes, turn=turn)
-    glb, lost = with_look(gltf.understood(path, data, "scene makes", adding), original, target)
-    place.write_bytes(remembering(glb, target))
-    tell_left(output, original, lost)
+    glb, lost = add_appearance(gltf.parse_document(path, data, "scene makes", adding), original, target)
+    place.write_bytes(record_source_mesh(glb, target))
+    warn_about_lost(output, original, lost)
 
 
 def check_shapes_output(path: Path) -> str:

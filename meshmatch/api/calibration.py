@@ -12,7 +12,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
-from meshmatch.fitting.usual import FEWEST, USUAL
+from meshmatch.fitting.reference_statistics import MIN_FITS, STATISTICS_KEY
 from meshmatch.models.card import ModelCard, write_card
 from meshmatch.models.registry import CARD, find_model
 from meshmatch.outputs import as_path
@@ -83,26 +83,28 @@ def calibrate(
         raise ModelError(
             f"{card.name} learned correspondence and needs no calibration", "its fits are judged as they are"
         )
-    if count < FEWEST:
-        raise OptionError(f"{count} shapes are too few for a calibration", f"use {FEWEST} or more")
+    if count < MIN_FITS:
+        raise OptionError(f"{count} shapes are too few for a calibration", f"use {MIN_FITS} or more")
     given = list_shapes(as_path(shapes)) if isinstance(shapes, str | Path) else list(shapes)
-    if len(given) < FEWEST:
+    if len(given) < MIN_FITS:
         raise _too_few_error(len(given))
     chosen = [given[k] for k in np.unique(np.linspace(0, len(given) - 1, min(count, len(given))).round().astype(int))]
     config = FitConfig(latent=LatentRefineConfig(steps=SEARCH_STEPS))
     matcher = Matcher(folder, config, threads=threads, progress=progress)
     fits = [fit for fit in matcher.fit_all(chosen, errors="return") if isinstance(fit, Fit) and fit.signs is not None]
-    if len(fits) < FEWEST:
+    if len(fits) < MIN_FITS:
         raise _too_few_error(len(fits))
     usual = {"fits": len(fits), "residual": float(np.median([fit.residual for fit in fits]))}
     usual["stretch"] = float(np.median([fit.signs.stretch for fit in fits if fit.signs is not None]))
-    card = replace(card, metrics=card.metrics | {USUAL: {name: round(value, 5) for name, value in usual.items()}})
+    card = replace(
+        card, metrics=card.metrics | {STATISTICS_KEY: {name: round(value, 5) for name, value in usual.items()}}
+    )
     write_card(card, folder / CARD)
     return card
 
 
 def _too_few_error(count: int) -> InputError:
-    return InputError(f"{count} shapes that can be fitted are too few for a calibration", f"give {FEWEST} or more")
+    return InputError(f"{count} shapes that can be fitted are too few for a calibration", f"give {MIN_FITS} or more")
 
 
 def list_shapes(folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ from meshmatch.api.inputs import LandmarkPairs, landmark_vertices, refuse_far_pa
 from meshmatch.api.results import MatchResult, maps_of_fits
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.maps.build import judged_by_pairs
+from meshmatch.maps.build import judge_by_pairs
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.repair import Repaired
 from meshmatch.threads import thread_limit, worker_slot
@@ -42,9 +42,9 @@ def match_without_model(
 
     `InputError` if a shape cannot be matched: it has large parts far apart, or is a cloud that is no surface.
     """
-    from meshmatch.fitting.alike import match_alike
-    from meshmatch.fitting.direct import CLEARLY
+    from meshmatch.fitting.direct import MIN_ENERGY_LEAD
     from meshmatch.fitting.one_way import DirectConfig
+    from meshmatch.fitting.same_pose import refine_match
 
     began, (source, target) = time.monotonic(), clean
     pairs = None if landmarks is None else landmark_vertices(clean, landmarks)
@@ -54,15 +54,15 @@ def match_without_model(
     found = _match_pair(source, target, configs[0], direct, threads, progress, known, by_model)
     if known is None and guess is None:
         with thread_limit(1), worker_slot(threading.Semaphore(threads)):
-            found = match_alike(source.shape, target.shape, found, configs[0], progress)
+            found = refine_match(source.shape, target.shape, found, configs[0], progress)
     fits = replace(found.source, repaired=source), replace(found.target, repaired=target)
     verdict = found.verdict
-    if guess is not None and verdict != "good" and (verdict == "poor" or found.over_guess < CLEARLY):
+    if guess is not None and verdict != "good" and (verdict == "poor" or found.guess_lead < MIN_ENERGY_LEAD):
         return guess
     with thread_limit(1):
         mapped, opposite = maps_of_fits((fits[0], fits[1]), (fits[0], fits[1]), threads)
         if pairs is not None:
-            mapped = judged_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
+            mapped = judge_by_pairs(mapped, target.original, pairs, fits[1].frame.scale)
     notes = direct_notes(clean, configs, unknown)
     if fits[0].frame.mirrored != fits[1].frame.mirrored:
         notes = (*notes, f"{target.shape.name}: taken for a mirror image of {source.shape.name}")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from meshmatch.api.inputs import as_model, usable
+from meshmatch.api.inputs import as_model, repair_allowing_parts
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit, check_fit
-from meshmatch.maps.fit_files import load_words, read_fit, write_fit
+from meshmatch.maps.fit_files import read_fit, read_fit_header, write_fit
 from meshmatch.maps.places import PlacedFit
 from meshmatch.models.registry import NO_MODEL, list_models
 from meshmatch.models.trained import TrainedModel
@@ -87,7 +87,7 @@ def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -
     """
     path = as_path(path)
     if model is None:
-        model = str(load_words(path)[0]["model"])
+        model = str(read_fit_header(path)[0]["model"])
         if model == NO_MODEL:
             raise InputError(f"{path.name} is a fit without a model", "open its folder: meshmatch.Collection(folder)")
         if model not in {entry.name for entry in list_models()}:
@@ -97,5 +97,5 @@ def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -
     read = read_fit(path, as_model(model).template)
     if read.shape is None:
         return read.fit
-    clean = replace(usable(read.shape), left_out=read.fit.left_out)
+    clean = replace(repair_allowing_parts(read.shape), left_out=read.fit.left_out)
     return replace(read.fit, verts=clean.shape.verts, repaired=clean)

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from meshmatch.api.bound import bind_garment, move_skeleton
 from meshmatch.api.results import MapPair, MovedMesh
+from meshmatch.api.skeletons import bind_garment, move_skeleton
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Int, Ints
 from meshmatch.outputs import as_path
+from meshmatch.shapes.deformed_files import check_insertion, save_moved
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.moved_files import check_into, save_moved
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.garment import carry_garment
 
@@ -86,16 +86,16 @@ class GarmentResult(MovedMesh):
             A file cannot be written.
         """
         if join:
-            check_into(self.body, as_path(path))
+            check_insertion(self.body, as_path(path))
         into = self.body if join else None
         save_moved(path, self.original, self.shape, self.turns, self.binding, self.turn, into)
 
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import transfer_html
-        from meshmatch.render.compose import compose_worn
+        from meshmatch.render.compose import compose_garments
 
         sunk = f"{len(self.pushed)} pushed out, {len(self.sunk)} below the skin"
-        draw = partial(compose_worn, [self.maps.target], [self.shape])
+        draw = partial(compose_garments, [self.maps.target], [self.shape])
         return transfer_html("Garment", self.maps.forward, draw, {"vertices of the garment": sunk})
 
 

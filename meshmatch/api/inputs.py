@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Int, Ints, off_torch
+from meshmatch.arrays import Int, Ints, to_numpy
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import landmark_places
+from meshmatch.shapes.alignment import in_single_precision
 from meshmatch.shapes.cloud import on_a_line
-from meshmatch.shapes.normalise import in_single_precision
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 
@@ -54,12 +54,12 @@ def as_model(model: TrainedModel | str | Path) -> TrainedModel:
     return load_once(model)
 
 
-def validated(shape: Shape) -> Repaired:
+def repair_or_raise(shape: Shape) -> Repaired:
     """Repair a shape, and raise `InputError` if it cannot be fitted.
 
     It then has too few faces or points, no surface area, or large parts far apart.
     """
-    clean = usable(shape)
+    clean = repair_allowing_parts(shape)
     refuse_far_parts(clean)
     return clean
 
@@ -72,8 +72,8 @@ def refuse_far_parts(clean: Repaired) -> None:
         raise InputError(problem, hint)
 
 
-def usable(shape: Shape) -> Repaired:
-    """As `validated`, but allow large parts far apart, for callers that can select parts."""
+def repair_allowing_parts(shape: Shape) -> Repaired:
+    """As `repair_or_raise`, but allow large parts far apart, for callers that can select parts."""
     clean = repair(shape)
     fixed = clean.shape
     name = shape.name or "the shape"
@@ -135,4 +135,4 @@ def landmark_vertices(
             hint = "leave out the landmarks, or choose nodes"
             raise OptionError(f"landmarks need refine='nodes', not {each.refine!r}", hint)
     landmark_places(clean, landmarks)
-    return np.asarray(off_torch(landmarks[0])), np.asarray(off_torch(landmarks[1]))
+    return np.asarray(to_numpy(landmarks[0])), np.asarray(to_numpy(landmarks[1]))

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from meshmatch.api.direct import direct_notes, fit_to_first
-from meshmatch.api.inputs import UnknownKindsError, configs_for, usable
+from meshmatch.api.inputs import UnknownKindsError, configs_for, repair_allowing_parts
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.matching import matcher_for
 from meshmatch.api.results import shape_of
-from meshmatch.api.upright import turn_of_fit
-from meshmatch.arrays import Brief, Floats
+from meshmatch.api.upright import upright_rotation_of_fit
+from meshmatch.arrays import Floats, ShortRepr
 from meshmatch.errors import OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.blend import WAYS, Blend, Deviation, Way
@@ -31,8 +31,8 @@ from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.deformed_files import MovedFile
 from meshmatch.shapes.files import ShapeLike, as_shapes
-from meshmatch.shapes.moved_files import MovedFile
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 
@@ -104,7 +104,7 @@ class InterpolationOptions:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Step(Brief):
+class Step(ShortRepr):
     """A frame of a sequence.
 
     ``time`` is 0 at the source and 1 at the target. ``rotation`` (3, 3) leads from the axes of the frame to those of the
@@ -275,7 +275,7 @@ def _register_directly(
         raise OptionError("without a model there is no template", "leave out the mesh: that of the first shape moves")
     if options.way == "codes":
         raise OptionError("without a model there are no codes", "leave out the blend: the field is blended")
-    clean = [usable(shape) for shape in shapes]
+    clean = [repair_allowing_parts(shape) for shape in shapes]
     fits, found = fit_to_first(clean, configs, matcher.threads, matcher.progress)
     return _Registered(fits, found.system, direct_notes(clean, configs, unknown))
 
@@ -386,12 +386,12 @@ def save_folder(path: str | Path, result: Interpolation, kind: str = "ply", orig
     names = [f"frame-{number:03d}.{kind}" for number in range(len(result.steps))]
     fit = result.fits[0]
     began = shape_of(fit).original if isinstance(fit, Fit) else None
-    turn = None if began is None or began.upright else turn_of_fit(fit)
+    turn = None if began is None or began.upright else upright_rotation_of_fit(fit)
     with folder_on_success(path) as folder:
-        plans = MovedFile.planned_all([folder / name for name in names], original)
+        plans = MovedFile.plan_all([folder / name for name in names], original)
         for plan, step in zip(plans, result.steps, strict=True):
             turns = np.broadcast_to(np.eye(3), (step.shape.V, 3, 3))
-            if plan.turns_normals and began is not None:
+            if plan.rotates_normals and began is not None:
                 turns = surface_rotations(began.verts, step.shape.verts, began.faces)
             plan.make_folders()
             plan.write(plan.files, step.shape, turns, turn=turn)

@@ -11,15 +11,20 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from meshmatch.api.apart import find_known_parts
 from meshmatch.api.inputs import UnknownKindsError, as_model, refuse_far_parts
+from meshmatch.api.known_parts import find_known_parts
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.classify import classify
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import boundary_length, may_show_part
-from meshmatch.fitting.judge.category import FAMILIAR, KNOWN, SURE, Readings
+from meshmatch.fitting.fitter import boundary_length, may_be_part
+from meshmatch.fitting.judge.category import (
+    MAX_CERTAIN_RESIDUAL,
+    MAX_KNOWN_RESIDUAL,
+    MAX_UNRIVALLED_RESIDUAL,
+    CategoryResiduals,
+)
 from meshmatch.maps.evaluate import CM, X100, ErrorUnit
 from meshmatch.models.card import ModelCard
 from meshmatch.models.registry import list_models
@@ -73,7 +78,10 @@ def _no_model_error() -> ModelError:
 
 
 def category_residuals(
-    models: Sequence[Installed], shapes: Sequence[Shape], configs: Sequence[FitConfig], sure: float = SURE
+    models: Sequence[Installed],
+    shapes: Sequence[Shape],
+    configs: Sequence[FitConfig],
+    sure: float = MAX_UNRIVALLED_RESIDUAL,
 ) -> Float[Floats, "M S"]:
     """Compute `category_residual` of repaired shapes by models, evaluating as few pairs as needed.
 
@@ -86,7 +94,7 @@ def category_residuals(
 
     The residual is infinite for pairs that are not evaluated, and where a model cannot be evaluated on a shape.
     """
-    evaluator = Readings([model.load for model in models], shapes, configs)
+    evaluator = CategoryResiduals([model.load for model in models], shapes, configs)
     found = evaluator.found
     parts = [_is_part(shape, config) for shape, config in zip(shapes, configs, strict=True)]
     boundary = [
@@ -98,11 +106,13 @@ def category_residuals(
         evaluator.ask(rows, [first])
         if found[:, first].min() <= sure:
             break
-    known = found[:, first].min() <= KNOWN
+    known = found[:, first].min() <= MAX_KNOWN_RESIDUAL
     kind = models[int(found[:, first].argmin())].card.category
     same = [row for row, model in enumerate(models) if model.card.category == kind and known]
     evaluator.ask(same, others)
-    unknown = [number for number in others if found[:, number].min() > KNOWN and not (known and parts[number])]
+    unknown = [
+        number for number in others if found[:, number].min() > MAX_KNOWN_RESIDUAL and not (known and parts[number])
+    ]
     evaluator.ask([row for row in range(len(models)) if row not in same], unknown)
     return found
 
@@ -118,7 +128,7 @@ def _order(models: Sequence[Installed]) -> list[list[int]]:
 
 def _is_part(shape: Shape, config: FitConfig) -> bool:
     """Whether the user says that a shape is partial, and its surface is consistent with that."""
-    return config.partial == "yes" and may_show_part(shape, replace(config, partial="auto"))
+    return config.partial == "yes" and may_be_part(shape, replace(config, partial="auto"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +186,7 @@ def choose_model(
     A point cloud, or a shape that may be partial, takes the kind of the other shapes if its own is uncertain. So does a mesh
     that resembles that kind weakly, if it resembles no other kind more; several such meshes take the kind they all resemble.
     If a mesh is of no known kind, or has large parts far apart, parts of it that are of a known kind are selected
-    (`meshmatch.api.apart`).
+    (`meshmatch.api.known_parts`).
 
     `InputError` if the shapes are of different kinds, or one of no known kind; `ModelError` if no model is installed.
     """
@@ -264,7 +274,7 @@ def _classify_all(
         if np.isinf(column[row]):
             return Classification(None, best.card)
         if _is_part(shape, config):  # its fit would say no more than the residual
-            return Classification(kind if column[row] <= KNOWN else None, best.card)
+            return Classification(kind if column[row] <= MAX_KNOWN_RESIDUAL else None, best.card)
         known, fit = classify(best.load(), shape, column[row], config, progress)
         return Classification(kind if known else None, best.card, fit)
 
@@ -282,7 +292,7 @@ def _refuse_unknown(
     if not kinds and len(found) > 1:
         kinds = {each.card.category for each in found}
     for shape, config, each, nearest in zip(shapes, configs, found, residuals.min(0), strict=True):
-        unknown = each.kind is None and not shape.is_cloud and not may_show_part(shape, config)
+        unknown = each.kind is None and not shape.is_cloud and not may_be_part(shape, config)
         if unknown and not _may_be_of_kind(each, kinds):
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} does not look like anything that the installed models know: {names}"
@@ -302,7 +312,7 @@ def _nearest_kind_hint(found: Classification) -> str:
     return f"nearest: {found.card.category}{trust}; {named}; {_HINT_WITHOUT}"
 
 
-def other_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:
+def differing_kind(model: TrainedModel, shape: Shape, config: FitConfig) -> str | None:
     """The kind of a repaired shape by the installed models, if it differs from the model's; else None."""
     try:
         models = installed_models()
@@ -333,7 +343,7 @@ def kinds_of(
         except InputError:  # of no use to any model
             residuals = np.full(len(models), np.inf)
         best = int(residuals.argmin())
-        found[name] = models[best].card.category if residuals[best] <= FAMILIAR else None
+        found[name] = models[best].card.category if residuals[best] <= MAX_CERTAIN_RESIDUAL else None
         if progress is not None:
             progress("looking for known kinds", "shapes", (number + 1) / len(sampled))
     return found
@@ -343,7 +353,10 @@ def is_person(shape: Shape) -> bool:
     """Whether the included model of people recognises a shape with certainty; False if it is not installed."""
     people = [model for model in installed_models() if model.built_in and model.card.category == _PEOPLE]
     try:
-        return bool(people) and category_residuals(people[:1], [repair(shape).shape], [FitConfig()])[0, 0] <= SURE
+        return (
+            bool(people)
+            and category_residuals(people[:1], [repair(shape).shape], [FitConfig()])[0, 0] <= MAX_UNRIVALLED_RESIDUAL
+        )
     except InputError:  # of no use to any model
         return False
 

@@ -23,23 +23,23 @@ from meshmatch.api.inputs import (
     configs_for,
     landmark_vertices,
     refuse_far_parts,
-    usable,
-    validated,
+    repair_allowing_parts,
+    repair_or_raise,
 )
 from meshmatch.api.results import MatchResult, maps_of_fits, shape_of
+from meshmatch.batching import CallBatcher
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit import Fit, check_fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import Fitter, check_landmarks, fits_with_landmarks
-from meshmatch.gathering import Gathering
-from meshmatch.maps.build import judged_by_pairs
+from meshmatch.fitting.fitter import Fitter, check_landmarks, refit_with_landmarks
+from meshmatch.maps.build import judge_by_pairs
 from meshmatch.maps.places import PlacedFit
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
-from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes, check_list
+from meshmatch.shapes.files import ShapeLike, as_shape, as_shapes, check_is_list
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map, thread_limit, worker_slot
@@ -200,15 +200,15 @@ class Matcher:
         if errors not in ("raise", "return"):
             raise OptionError(f"errors cannot be {errors!r}", "choose raise or return")
         if errors == "return":
-            check_list(shapes)
+            check_is_list(shapes)
             shapes = list(shapes)
             return self._fit_each(shapes, configs_for(config or self.config, len(shapes)))
-        clean = [usable(shape) for shape in as_shapes(shapes)]
+        clean = [repair_allowing_parts(shape) for shape in as_shapes(shapes)]
         # a single fit may use all requested threads; of several fits, each uses one
         inner = self._requested_threads if len(clean) == 1 else 1
         configs = configs_for(config or self.config, len(clean))
         clean, kind_notes, preliminary = self._choose_model(clean, configs)
-        fits = self._fit_all(clean, configs, preliminary, Gathering(len(clean), self.threads, _BATCH_SIZE), inner)
+        fits = self._fit_all(clean, configs, preliminary, CallBatcher(len(clean), self.threads, _BATCH_SIZE), inner)
         return [replace(fit, notes=(*kind, *fit.notes)) for kind, fit in zip(kind_notes, fits, strict=True)]
 
     def follow(self, shape: ShapeLike, last: Fit) -> Fit:
@@ -236,13 +236,13 @@ class Matcher:
         MeshmatchError
             ``last`` is not a `Fit`; or as for `fit`.
         """
-        from meshmatch.fitting.following import follow
+        from meshmatch.fitting.tracking import track
 
         check_fit(last)
         last.check_template(self.model.template.hash)
-        clean = validated(as_shape(shape))
+        clean = repair_or_raise(as_shape(shape))
         with thread_limit(1):
-            found = follow(Fitter(self.model, self.config), clean.shape, last)
+            found = track(Fitter(self.model, self.config), clean.shape, last)
             best = self._with_shape_and_notes(*self._retry_with_parts(found, clean, self.config), self.config)
             return self._refine_further(best, self.config, turned=False)
 
@@ -324,7 +324,7 @@ class Matcher:
             The map and both fits.
         """
         began = time.monotonic()
-        clean = [usable(as_shape(source, "source")), usable(as_shape(target, "target"))]
+        clean = [repair_allowing_parts(as_shape(source, "source")), repair_allowing_parts(as_shape(target, "target"))]
         configs = configs_for(config or self.config, 2)
         if self._direct:
             return match_without_model(clean, configs, landmarks, self.threads, self.progress)
@@ -336,17 +336,17 @@ class Matcher:
             check_landmarks(self.model)
             pairs = landmark_vertices(clean, landmarks, configs)  # checked before the fits
         with thread_limit(1):
-            fits = self._fit_all(clean, configs, preliminary, Gathering(2, self.threads))
+            fits = self._fit_all(clean, configs, preliminary, CallBatcher(2, self.threads))
             known_pairs = None
             if landmarks is not None:
                 clean = [shape_of(fit) for fit in fits]
-                guided, known_pairs = fits_with_landmarks(self.model, clean, fits, pairs, configs)
+                guided, known_pairs = refit_with_landmarks(self.model, clean, fits, pairs, configs)
                 fits = [self._with_shape_and_notes(*each) for each in zip(guided, clean, configs, strict=True)]
             before = fits[0], fits[1]
             agreed = self._refine_jointly(before, configs[0], known_pairs)
             found, opposite = maps_of_fits(agreed, before, self.threads)
             if landmarks is not None:
-                found = judged_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
+                found = judge_by_pairs(found, clean[1].original, pairs, agreed[1].frame.scale)
         notes = tuple(
             dict.fromkeys((*(words for kind in kind_notes for words in kind), *fits[0].notes, *fits[1].notes))
         )
@@ -381,7 +381,7 @@ class Matcher:
         Other shapes are returned unchanged.
         """
         if clean.far_parts:
-            from meshmatch.api.apart import find_known_parts
+            from meshmatch.api.known_parts import find_known_parts
 
             alone = find_known_parts([lambda: self.model], clean.original, config, progress=self.progress)
             if alone is not None:
@@ -395,14 +395,14 @@ class Matcher:
         """Return the fit of a shape, or a better one of some of its parts if it is poor, and the shape that was fitted."""
         if whole.verdict != "poor":
             return whole, clean
-        from meshmatch.api.apart import fit_known_parts
+        from meshmatch.api.known_parts import fit_known_parts
 
         return fit_known_parts(self.model, clean, config, progress) or (whole, clean)
 
     def _fit_each(self, shapes: Sequence[ShapeLike], configs: Sequence[FitConfig]) -> list[Fit | MeshmatchError]:
         """Fit each shape; errors take the place of fits."""
         done, counter_lock, stop = 0, threading.Lock(), threading.Event()
-        gathering = Gathering(len(shapes), self.threads, _BATCH_SIZE)
+        gathering = CallBatcher(len(shapes), self.threads, _BATCH_SIZE)
 
         def fit_one(number: int, config: FitConfig) -> Fit | MeshmatchError:
             nonlocal done
@@ -410,7 +410,7 @@ class Matcher:
             with gathering.task():
                 try:
                     clean, kind_notes, preliminary = self._choose_model(
-                        [usable(as_shape(shapes[number], f"shape {number + 1}"))], [config]
+                        [repair_allowing_parts(as_shape(shapes[number], f"shape {number + 1}"))], [config]
                     )
                     found = self._fit_one(clean[0], config, preliminary[0], gathering, stop, clean[0].shape.name)
                     found = replace(found, notes=(*kind_notes[0], *found.notes))
@@ -430,7 +430,7 @@ class Matcher:
         clean: Sequence[Repaired],
         configs: Sequence[FitConfig],
         preliminary: Sequence[_Preliminary],
-        gathering: Gathering,
+        gathering: CallBatcher,
         inner: int = 1,
     ) -> list[Fit]:
         """Fit all shapes as tasks of a gathering, each with ``inner`` threads of the numerical libraries."""
@@ -449,7 +449,7 @@ class Matcher:
         clean: Repaired,
         config: FitConfig,
         preliminary: _Preliminary,
-        gathering: Gathering,
+        gathering: CallBatcher,
         stop: threading.Event,
         label: str,
     ) -> Fit:
@@ -468,7 +468,7 @@ class Matcher:
 
     def _with_shape_and_notes(self, fit: Fit, clean: Repaired, config: FitConfig) -> Fit:
         """Add to a fit its shape, and notes on repairs and options."""
-        from meshmatch.api.apart import may_contain_known_parts
+        from meshmatch.api.known_parts import may_contain_known_parts
 
         prefix = f"{clean.shape.name}: " if clean.shape.name else ""
         notes = [f"{prefix}{note}" for note in clean.notes]
@@ -494,9 +494,9 @@ class Matcher:
         shapes = [shape_of(fit).shape for fit in fits]
         done = [False, False]  # joint refinement would discard fits that were refined further
         if not (known_pairs or self.model.card.correspondence):
-            from meshmatch.fitting.alike import is_finer
+            from meshmatch.fitting.same_pose import is_refined
 
-            done = [is_finer(self.model, fit) for fit in fits]
+            done = [is_refined(self.model, fit) for fit in fits]
         if all(done):
             return fits
         agreed = agreed_fits(self.model, shapes, list(fits), config, known_pairs, threads=self.threads)
@@ -509,6 +509,6 @@ class Matcher:
         """Refine the fit of a model without learned correspondence with more nodes; other fits stay as they are."""
         if self.model.card.correspondence:
             return fit
-        from meshmatch.fitting.alike import finer
+        from meshmatch.fitting.same_pose import refine_fit
 
-        return finer(self.model, shape_of(fit).shape, fit, config, progress, turned)
+        return refine_fit(self.model, shape_of(fit).shape, fit, config, progress, turned)

@@ -22,7 +22,7 @@ from meshmatch.transfer.measurements import (
     Measurement,
     Measurements,
     MeasuringPoints,
-    each_once,
+    check_unique,
     load_measurements,
     save_measurements,
 )
@@ -76,7 +76,7 @@ def measure(
     >>> found = meshmatch.measure("body", "templates/samples/dancer.ply").data
     >>> dict(zip(found.names, found.values))  # unit of the dancer's file
     """
-    points = own_points(source, measurements, landmarks)
+    points = measuring_points(source, measurements, landmarks)
     maps = find_maps(points.shape, target, match)
     with thread_limit(1):
         found = points.taken(push_landmarks(maps.forward, maps.source, maps.target, points.points), rule.minimum)
@@ -85,7 +85,7 @@ def measure(
     return Transferred(found, found.confidence, LowConfidence(len(found.names), lost, lost), maps, write)
 
 
-def own_points(
+def measuring_points(
     source: ShapeLike,
     measurements: Sequence[Measurement] | str | Path | None = None,
     landmarks: Landmarks | ArrayLike | str | Path | None = None,
@@ -94,7 +94,7 @@ def own_points(
     source, measurements, landmarks = measure_inputs(source, measurements, landmarks)
     space = mesh_space(source) if isinstance(source, str | Path) else ""
     shape = as_shape(source, "source")
-    given = load_measurements(measurements) if isinstance(measurements, str | Path) else each_once(measurements)
+    given = load_measurements(measurements) if isinstance(measurements, str | Path) else check_unique(measurements)
     return MeasuringPoints.of(shape, given_landmarks(landmarks, shape, space), given)
 
 
@@ -110,7 +110,7 @@ def measure_inputs(
     if is_body(source):
         folder = bundled_folder() / "measurements"
         own = folder / "body-measurements.csv", folder / "body-landmarks.csv"
-        source = meant_source(source)
+        source = resolve_source(source)
         return source, own[0] if measurements is None else measurements, own[1] if landmarks is None else landmarks
     if measurements is None or landmarks is None:
         what = "measurements" if measurements is None else "landmarks"
@@ -124,7 +124,7 @@ def is_body(source: object) -> bool:
     return isinstance(source, str | Path) and str(source) == BODY
 
 
-def meant_source(source: ShapeLike) -> ShapeLike:
+def resolve_source(source: ShapeLike) -> ShapeLike:
     """Return the source; for `BODY`, the path of the included body."""
     return bundled_folder() / "measurements" / "body.ply" if is_body(source) else source
 

@@ -17,7 +17,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.render import compose
 from meshmatch.render.compose import Composition, merge_labels
-from meshmatch.render.facing import facing, facing_alike
+from meshmatch.render.facing import guess_rotation, rotation_like
 from meshmatch.render.picture import Look, check_picture
 from meshmatch.render.viewer.looks import share_look
 from meshmatch.render.viewer.page import PageReport, write_page
@@ -224,10 +224,10 @@ def _rotations(
     if first is not None and second is not None and maps.forward.verdict != "poor":
         # The frame of a fit follows the trunk; standing shapes are to stay on the ground.
         pairs = (maps.source, first), (maps.target, second)
-        first, second = (facing_alike(shape, shape.verts, shape.verts @ turn.T) for shape, turn in pairs)
+        first, second = (rotation_like(shape, shape.verts, shape.verts @ turn.T) for shape, turn in pairs)
         return first, second
     if up is not None or front is not None:
-        return facing(maps.source, up, front), None
+        return guess_rotation(maps.source, up, front), None
     if isinstance(source, str | Path) and Path(source).suffix.lower() in GLTF_SUFFIXES:
         return np.eye(3), None  # the format says: y up, z to the front
     return None, None

@@ -11,27 +11,27 @@ from typing import Any
 import numpy as np
 
 from meshmatch.api.inputs import MINIMUM_FACES, MINIMUM_POINTS
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, ShortRepr
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.direct import MIRROR
 from meshmatch.fitting.kind_templates import mean_shape, template_of, with_more_nodes
+from meshmatch.fitting.reference_statistics import MIN_FITS, drop_poor, have_sides
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.usual import FEWEST, believed, have_sides
-from meshmatch.fitting.without_model import Standing, fit_turned, standing
+from meshmatch.fitting.without_model import RigidAlignment, align_by_fits, fit_rotated
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import Progress, ProgressCallback
+from meshmatch.shapes.alignment import Align, Mirroring, sqrt_area_frame
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape, save_shape
 from meshmatch.shapes.input_files import suffix_of
 from meshmatch.shapes.landmark_files import mesh_space
-from meshmatch.shapes.normalise import Align, Mirroring, sqrt_area_frame
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import prepared_folder
 from meshmatch.templates.make import LOW_FACES, NodeConfig, low_mesh, make_template
+from meshmatch.templates.mirror_images import find_mirrored, is_mirrored, mirrored
 from meshmatch.templates.prepared_folder import MAX_RESIDUAL, find_landmarks
-from meshmatch.templates.sides import is_other_side, mirrored, other_side
 from meshmatch.templates.template import Scale, Template, save_arrays, save_template
 from meshmatch.threads import parallel_map
 
@@ -44,7 +44,7 @@ _MIN_ALIKE = 0.8
 
 
 @dataclass(frozen=True, repr=False)
-class PrepareConfig(Brief):
+class PrepareConfig(ShortRepr):
     """How shapes are prepared.
 
     Attributes
@@ -85,7 +85,7 @@ class PrepareConfig(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Prepared(Brief):
+class Prepared(ShortRepr):
     """The result of `prepare`: a template, and the registered shapes.
 
     Attributes
@@ -298,15 +298,15 @@ def _read_shapes(
         progress((number + 1) / len(pairs))
     if not found:
         raise InputError(f"no shape in {folder} could be used", notes[0])
-    return found, prepared_folder.in_one_order(known)
+    return found, prepared_folder.sort_by_name(known)
 
 
 @dataclass(frozen=True, eq=False)
 class _Orientations:
     """How each shape, and its mirror image, is oriented relative to a template that is only rotated."""
 
-    plain: Sequence[Standing]
-    image: Sequence[Standing]
+    plain: Sequence[RigidAlignment]
+    image: Sequence[RigidAlignment]
 
     def turned(
         self, mirror: bool, others_than_most: bool
@@ -342,15 +342,15 @@ def _compare_orientations(
     """
     N = len(found)
     whole = found[chosen].shape if isinstance(chosen, int) else chosen.shape
-    if config.align not in (None, "rigid") or whole.is_cloud or not FEWEST <= N <= _MAX_SIDES:
+    if config.align not in (None, "rigid") or whole.is_cloud or not MIN_FITS <= N <= _MAX_SIDES:
         return None
     if prepared_folder.same_faces(found[0], found):
         return None
     template, others = template_of(whole, whole.name, ViscousConfig()), 0
-    orientations: list[list[Standing]] = []
+    orientations: list[list[RigidAlignment]] = []
     for each in found:
         sides = [each.shape, mirrored(each.shape)]
-        orientations.append(parallel_map(lambda shape: standing(template, shape, config.nodes.seed), sides))
+        orientations.append(parallel_map(lambda shape: align_by_fits(template, shape, config.nodes.seed), sides))
         others += not any(side.alike for side in orientations[-1])
         if others > (1 - _MIN_ALIKE) * N:
             return None
@@ -367,13 +367,13 @@ def _find_mirror_images(
     """
     if config.mirror == "no" or len(found) > _MAX_SIDES or prepared_folder.same_faces(found[0], found):
         return np.zeros(len(found), bool)
-    flags = other_side(found, config.scale, config.nodes.seed, progress)
+    flags = find_mirrored(found, config.scale, config.nodes.seed, progress)
     if flags.any() and named is not None:
         if isinstance(named, int):
             other = bool(flags[named])
         else:
             one_side = [clean for clean, flag in zip(found, flags, strict=True) if not flag]
-            other = is_other_side(named, one_side, config.scale, config.nodes.seed)
+            other = is_mirrored(named, one_side, config.scale, config.nodes.seed)
         flags = flags ^ other
     return flags
 
@@ -444,9 +444,9 @@ def _mean_template(
     alike = [(clean.shape, turn) for clean, turn in zip(found, turns, strict=True) if turn is not None]
     sampled = np.unique(np.linspace(0, len(alike) - 1, min(len(alike), _MAX_AVERAGED)).astype(int))
     for shape, turn in (alike[number] for number in sampled):
-        fits.append(fit_turned(finer, shape, turn, viscous))
+        fits.append(fit_rotated(finer, shape, turn, viscous))
         progress(len(fits) / len(sampled))
-    sound = believed(fits)
+    sound = drop_poor(fits)
     if not sound:
         return template, 0
     mean = Shape(mean_shape(finer, sound), template.shape.faces)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from meshmatch.api.inputs import check_seed
 from meshmatch.api.kinds import UnitName, error_unit
-from meshmatch.arrays import Brief, Float, Floats, off_torch
+from meshmatch.arrays import Float, Floats, ShortRepr, to_numpy
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.maps.build import build_map
@@ -22,14 +22,14 @@ from meshmatch.maps.evaluate import Evaluation, SurfaceDistance, evaluate_map
 from meshmatch.maps.files import load_map
 from meshmatch.maps.mapped_mesh import invert_map
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
-from meshmatch.maps.unfold_pair import unfolded_pair
+from meshmatch.maps.unfold_pair import unfold_pair
 from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.deformed_files import save_moved
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats.gltf_rig import Binding
-from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MovedMesh(Brief):
+class MovedMesh(ShortRepr):
     """A mesh with moved vertices: the base of the results of `transfer_garment` and `wrap`.
 
     Attributes
@@ -190,7 +190,7 @@ class MatchResult:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MapPair(Brief):
+class MapPair(ShortRepr):
     """The maps between two shapes in both directions.
 
     Attributes
@@ -267,7 +267,7 @@ def maps_of_fits(
     found, back = build_map(here, there, threads), None
     if source is not None and target is not None:
         partial = _partial(first) or _partial(second)
-        found, back = unfolded_pair(found, lambda: build_map(there, here, threads), source, target, partial, threads)
+        found, back = unfold_pair(found, lambda: build_map(there, here, threads), source, target, partial, threads)
     ups = [fit.up if isinstance(fit, Fit) else "" for fit in fits]
     return replace(found, source_up=ups[0], target_up=ups[1]), back
 
@@ -321,7 +321,7 @@ class ConfidenceRule:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Transferred(Brief, Generic[T]):
+class Transferred(ShortRepr, Generic[T]):
     """Attributes transferred to the target.
 
     Attributes
@@ -442,7 +442,7 @@ def evaluate(
         check_map(each)
     known = truth if isinstance(truth, tuple) and len(truth) == 2 else (None, truth)
     if tuple(getattr(truth, "shape", ()))[1:] == (2,):
-        first, second = np.asarray(off_torch(truth)).T
+        first, second = np.asarray(to_numpy(truth)).T
         known = first, second
     check_seed(seed)
     rng = np.random.default_rng(seed)

@@ -10,30 +10,30 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from meshmatch.api.bound import INFLUENCES
 from meshmatch.api.results import MapPair
+from meshmatch.api.skeletons import INFLUENCES
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import vertex_weights
-from meshmatch.arrays import Brief
+from meshmatch.arrays import ShortRepr
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.fitting.search.frames import axis_vector
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
-from meshmatch.shapes.files import ShapeLike, as_scene, as_shape, load_shape
+from meshmatch.shapes.deformed_files import add_appearance, warn_about_lost
+from meshmatch.shapes.files import ShapeLike, as_gltf_scene, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, gltf_vrm
-from meshmatch.shapes.formats.gltf_edit import remembering
-from meshmatch.shapes.formats.gltf_former import figures_apart, hanging_groups
-from meshmatch.shapes.formats.gltf_humanoid import Person, person_of, with_bones
+from meshmatch.shapes.formats.gltf_add_skeleton import with_skeleton
+from meshmatch.shapes.formats.gltf_attachments import find_rigid_groups, find_separate_figures
+from meshmatch.shapes.formats.gltf_edit import record_source_mesh
+from meshmatch.shapes.formats.gltf_humanoid import HumanoidBones, find_humanoid_bones, with_humanoid_bones
 from meshmatch.shapes.formats.gltf_rig import Binding, Rig, read_rig
-from meshmatch.shapes.formats.gltf_rigged import rigged
 from meshmatch.shapes.input_files import read_bytes
-from meshmatch.shapes.moved_files import tell_left, with_look
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import joint_table, most_votes, pull_weights
-from meshmatch.transfer.carry_rig import UP, carry, upright
-from meshmatch.transfer.clean_weights import beyond, clean_weights, rigid
+from meshmatch.transfer.carry_rig import UP, rotation_to_upright, transfer_skeleton
+from meshmatch.transfer.clean_weights import clean_weights, find_uncovered, make_rigid
 from meshmatch.transfer.retarget_clips import points_at_start, standing_clips
 from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
@@ -49,7 +49,7 @@ check_rig_suffix = partial(tables.check_suffix, suffixes=(".glb", gltf_vrm.SUFFI
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RiggedResult(Brief):
+class RiggedResult(ShortRepr):
     """The target with the source's skeleton: the result of `transfer_rig`.
 
     Attributes
@@ -136,12 +136,12 @@ def write_rig(result: RiggedResult, output: Path, place: Path) -> None:
     person, glb = check_rig_output(output, result.source, result.original), result.glb
     if person is not None:
         name = output if result.original is None else result.original
-        glb = gltf.understood(name, glb, "scene makes", lambda document: with_bones(document, person))
+        glb = gltf.parse_document(name, glb, "scene makes", lambda document: with_humanoid_bones(document, person))
     place.write_bytes(glb)
-    tell_left(output, result.original, result.lost)
+    warn_about_lost(output, result.original, result.lost)
 
 
-def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | None:
+def check_rig_output(path: Path, source: Path, target: Path | None) -> HumanoidBones | None:
     """Check an output before the transfer; return the humanoid bones for a .vrm, else None.
 
     `OptionError` if the format does not support rigs, or the humanoid bones of the source's skeleton are unknown.
@@ -151,10 +151,12 @@ def check_rig_output(path: Path, source: Path, target: Path | None) -> Person | 
     gltf_vrm.check_character(target, path)
     assert target is not None
 
-    def find_person(document: gltf.Document) -> Person | None:
-        return gltf.understood(target, read_bytes(target), "scene makes", lambda body: person_of(document, body))
+    def find_person(document: gltf.Document) -> HumanoidBones | None:
+        return gltf.parse_document(
+            target, read_bytes(target), "scene makes", lambda body: find_humanoid_bones(document, body)
+        )
 
-    person = gltf.understood(source, read_bytes(source), "skeleton makes", find_person)
+    person = gltf.parse_document(source, read_bytes(source), "skeleton makes", find_person)
     if person is None:
         problem = f"{path.name} would be no character: the humanoid bones of {source.name} are unknown"
         raise OptionError(
@@ -251,7 +253,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         raise InputError(f"{source_shape.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
     data = read_bytes(source)
     rig, weights = read_rig(source, data), load_weights(source, source_shape)
-    if n_constraints := gltf.understood(
+    if n_constraints := gltf.parse_document(
         source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)
     ):
         what = (
@@ -262,11 +264,11 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         warn(f"{source_shape.name} has {what} not transferred")
     _warn_of_stretched_joints(source_shape.name, rig)
     target_shape = as_shape(target, "target")
-    path, data, in_gltf = as_scene(target, target_shape)
-    rigid_groups = gltf.understood(path, data, "scene makes", hanging_groups)
+    path, data, in_gltf = as_gltf_scene(target, target_shape)
+    rigid_groups = gltf.parse_document(path, data, "scene makes", find_rigid_groups)
     maps = find_maps(source_shape, target_shape, match)
-    kept_figures = gltf.understood(
-        path, data, "scene makes", lambda document: figures_apart(document, maps.forward.index)
+    kept_figures = gltf.parse_document(
+        path, data, "scene makes", lambda document: find_separate_figures(document, maps.forward.index)
     )
     if kept_figures:
         keeps = "keeps its" if len(kept_figures) == 1 else "keep their"
@@ -278,22 +280,22 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     _warn_of_lying_clips(source_shape, rig, weights, maps.forward.source_up, target_shape.name or "the target")
     with thread_limit(1):
         points, share = maps.forward.points(target_shape), vertex_weights(source_shape, maps)
-        turn = np.eye(3) if in_gltf else upright(source_shape, points, share)
+        turn = np.eye(3) if in_gltf else rotation_to_upright(source_shape, points, share)
         ground = float((target_shape.verts[target_shape.valid] @ turn.T)[:, UP].min())
-        carried = carry(rig, weights.matrix, source_shape, points @ turn.T, share, ground)
+        carried = transfer_skeleton(rig, weights.matrix, source_shape, points @ turn.T, share, ground)
         pulled_weights = pull_weights(maps.backward, weights.matrix, INFLUENCES)
-        unknown = beyond(target_shape, points, source_shape.faces)
-        target_weights = rigid(clean_weights(pulled_weights, target_shape, INFLUENCES, unknown), rigid_groups)
+        unknown = find_uncovered(target_shape, points, source_shape.faces)
+        target_weights = make_rigid(clean_weights(pulled_weights, target_shape, INFLUENCES, unknown), rigid_groups)
         standing, posed = carried.bind, carried.source_pose
         standing = posed if pose == "source" else replace(standing, clips=standing_clips(standing, posed))
         binding = Binding(standing, carried.bind.worlds(), *joint_table(target_weights), turn)
-        glb, replaced = gltf.understood(
-            path, data, "scene makes", lambda document: rigged(document, binding, kept_figures)
+        glb, replaced = gltf.parse_document(
+            path, data, "scene makes", lambda document: with_skeleton(document, binding, kept_figures)
         )
     before, after = (np.asarray(each.sum(axis=0)).ravel() > 0 for each in (weights.matrix, target_weights))
     unused = tuple(weights.names[joint] for joint in np.flatnonzero(before & ~after))
     skin = SkinWeights(target_weights, weights.names)
     original = as_path(target) if isinstance(target, str | Path) else None
-    glb, lost = with_look(glb, original, target_shape)
-    output = remembering(glb, target_shape)
+    glb, lost = add_appearance(glb, original, target_shape)
+    output = record_source_mesh(glb, target_shape)
     return RiggedResult(standing, skin, unused, replaced.joints, replaced.clips, maps, output, source, original, lost)

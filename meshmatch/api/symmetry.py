@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshmatch.api.inputs import check_config, checked_threads, validated
+from meshmatch.api.inputs import check_config, checked_threads, repair_or_raise
 from meshmatch.api.results import maps_of_fits
-from meshmatch.arrays import Brief, Float, Floats
-from meshmatch.fitting.across import image_in, match_across
+from meshmatch.arrays import Float, Floats, ShortRepr
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.search.planes import MirrorPlane
+from meshmatch.fitting.self_symmetry import match_to_mirror_image, mirror_image
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
@@ -22,7 +22,7 @@ from meshmatch.threads import thread_limit, worker_slot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Symmetry(Brief):
+class Symmetry(ShortRepr):
     """The result of `find_symmetry`.
 
     Attributes
@@ -100,10 +100,10 @@ def find_symmetry(
     began, config, count = time.monotonic(), config or FitConfig(), checked_threads(threads)
     check_config(config)
     original = as_shape(shape)
-    clean = validated(original)
+    clean = repair_or_raise(original)
     with thread_limit(1), worker_slot(threading.Semaphore(count)):
-        plane, found = match_across(clean.shape, config, progress)
-    image = replace(clean, shape=image_in(plane, clean.shape), original=image_in(plane, original))
+        plane, found = match_to_mirror_image(clean.shape, config, progress)
+    image = replace(clean, shape=mirror_image(plane, clean.shape), original=mirror_image(plane, original))
     fits = replace(found.source, repaired=clean), replace(found.target, repaired=image)
     with thread_limit(1):
         to_image = maps_of_fits(fits, fits, count)[0]

@@ -13,7 +13,7 @@ import numpy as np
 from meshmatch.api.results import MapPair
 from meshmatch.api.transfer import MapLike, find_maps
 from meshmatch.api.upright import turn_upright
-from meshmatch.arrays import Brief, Ints
+from meshmatch.arrays import Ints, ShortRepr
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import as_path
 from meshmatch.progress import Progress, ProgressCallback
@@ -49,7 +49,7 @@ _MIN_REPORTED = 0.002  # share of texels with several places that is reported
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TexturedResult(Brief):
+class TexturedResult(ShortRepr):
     """The target with its new texture: the result of `transfer_texture`.
 
     Attributes
@@ -204,7 +204,7 @@ def transfer_texture(
             atlas = _transfer_layout(shape, look, maps, polygons, options.size)
         elif atlas.shared:
             atlas = _check_shared(
-                atlas, bake.contradicted(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
+                atlas, bake.contradicting_share(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
             )
         tiles: dict[int, BakedMaterial] = {}
         if atlas.tiles is None:
@@ -246,7 +246,7 @@ def _transfer_layout(shape: Shape, look: Appearance, maps: MapPair, polygons: In
         problem = f"the layout of {name} cannot be carried over: it covers the image {layers:.1f} times"
         raise OptionError(problem, "leave out --uv source")
     atlas = Atlas(coordinates, False, shared=shared_texels(coordinates))
-    differ = bake.contradicted(shape, look, maps.target, maps.backward, atlas) if atlas.shared else 0.0
+    differ = bake.contradicting_share(shape, look, maps.target, maps.backward, atlas) if atlas.shared else 0.0
     if differ * atlas.shared > _MAX_CONTRADICTED:
         problem = (
             f"the layout of {name} cannot be carried over: of its texels {100 * atlas.shared:.0f} % have several places"

@@ -17,13 +17,13 @@ from scipy.sparse import csr_array
 
 from meshmatch.api.results import ConfidenceRule, MapPair, MatchResult, Transferred
 from meshmatch.api.upright import turn_upright
-from meshmatch.arrays import Floats, as_numbers, off_torch
+from meshmatch.arrays import Floats, as_numbers, to_numpy
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
-from meshmatch.shapes.colors import light, seen
-from meshmatch.shapes.dressed_files import tell_lost
+from meshmatch.shapes.colors import linear_to_srgb_alpha, srgb_to_linear_alpha
+from meshmatch.shapes.dressed_files import warn_about_losses
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_vrm import check_character
@@ -33,7 +33,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.attributes import pull_directions, pull_face_labels, pull_labels, pull_values, pull_weights
 from meshmatch.transfer.bake import colors_of_vertices
-from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, named, save_labels
+from meshmatch.transfer.label_files import Labels, On, labels_of, load_labels, name_labels, save_labels
 from meshmatch.transfer.landmarks import (
     Landmarks,
     at_points,
@@ -41,10 +41,10 @@ from meshmatch.transfer.landmarks import (
     landmarks_with_warnings,
     push_landmarks,
     save_landmarks,
-    warn_of_far_ones,
+    warn_if_far,
 )
 from meshmatch.transfer.low_confidence import LowConfidence, replace_low_labels, replace_low_values, replace_low_weights
-from meshmatch.transfer.value_files import Values, checked_colors, light_of, save_colors, save_values
+from meshmatch.transfer.value_files import Values, check_colors, linear_colors, save_colors, save_values
 from meshmatch.transfer.weight_files import SkinWeights, load_weights, save_weights, weights_of
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def _file_of(shape: ShapeLike) -> Path | None:
 
 
 def _write_values(values: Floats, target: Shape, file: Path | None, path: Path, final: Path) -> None:
-    tell_lost(file, final, save_values(path, Values(values), target, file))
+    warn_about_losses(file, final, save_values(path, Values(values), target, file))
 
 
 def transfer_colors(
@@ -236,11 +236,11 @@ def transfer_colors(
     >>> colored.data  # (V_target, 4)
     """
     source = as_shape(source, "source")
-    given = None if isinstance(colors, Appearance) else light_of(source, colors)
+    given = None if isinstance(colors, Appearance) else linear_colors(source, colors)
     blank = None
     if rule.blank is not None:
-        chosen = checked_colors(as_numbers(rule.blank, "blank"))
-        blank = light(np.append(chosen, 1.0)[:4])  # opaque unless alpha is given
+        chosen = check_colors(as_numbers(rule.blank, "blank"))
+        blank = srgb_to_linear_alpha(np.append(chosen, 1.0)[:4])  # opaque unless alpha is given
     maps = find_maps(source, target, match)
     with thread_limit(1):
         if given is not None:
@@ -250,7 +250,7 @@ def transfer_colors(
             found = colors_of_vertices(maps.source, colors, maps.target, maps.backward)
         confidence = maps.backward.confidence.astype(np.float64)
         found, low = replace_low_values(found, confidence < rule.minimum, maps.target, blank, rule.fill)
-    colors = seen(found)
+    colors = linear_to_srgb_alpha(found)
     return Transferred(colors, confidence, low, maps, partial(_write_colors, colors, maps, _file_of(target)))
 
 
@@ -258,7 +258,7 @@ def _write_colors(colors: Floats, maps: MapPair, file: Path | None, path: Path, 
     check_character(file, final)
     along_y = Path(maps.source.name).suffix.lower() in gltf.SUFFIXES
     turn = turn_upright(maps, along_y) if path.suffix.lower() == ".glb" else None  # an fbx is first written as a glb
-    tell_lost(file, final, save_colors(path, maps.target, colors, file, turn))
+    warn_about_losses(file, final, save_colors(path, maps.target, colors, file, turn))
 
 
 def transfer_labels(
@@ -329,12 +329,12 @@ def transfer_labels(
             found = pull_labels(back, source, given.codes, of_face)
         is_low = confidence < rule.minimum
         found, low = replace_low_labels(found, is_low, target, blank is not None, rule.fill, kind == "faces")
-    labeled = named(found, given, kind, blank)
+    labeled = name_labels(found, given, kind, blank)
     return Transferred(labeled, confidence, low, maps, partial(_write_labels, labeled, target, file))
 
 
 def _write_labels(labels: Labels, target: Shape, file: Path | None, path: Path, final: Path) -> None:
-    tell_lost(file, final, save_labels(path, labels, target, file))
+    warn_about_losses(file, final, save_labels(path, labels, target, file))
 
 
 def transfer_weights(
@@ -470,7 +470,7 @@ def given_landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape
     if isinstance(landmarks, str | Path):
         return landmarks_with_warnings(landmarks, source, space)
     try:
-        places = np.asarray(off_torch(landmarks))
+        places = np.asarray(to_numpy(landmarks))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"landmarks are no array of numbers ({error})", "give vertices (N,) or positions (N, 3)"
@@ -479,7 +479,7 @@ def given_landmarks(landmarks: Landmarks | ArrayLike | str | Path, source: Shape
         return at_vertices(source, places)
     if places.ndim == 2 and places.shape[1] == 3 and places.dtype.kind in "iuf":
         found, distance = at_points(source, places.astype(np.float64))
-        warn_of_far_ones(source, float(distance.max(initial=0.0)))
+        warn_if_far(source, float(distance.max(initial=0.0)))
         return found
     hint = "give vertices (N,) as integers, or positions (N, 3)"
     raise InputError(f"landmarks cannot be an array of {places.shape} {places.dtype}", hint)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from meshmatch.api import matching
-from meshmatch.api.bound import move_skeleton
 from meshmatch.api.inputs import LandmarkPairs
 from meshmatch.api.results import MatchResult, MovedMesh
+from meshmatch.api.skeletons import move_skeleton
 from meshmatch.api.upright import turn_of_moved
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.errors import InputError, OptionError
@@ -24,7 +24,7 @@ from meshmatch.models.registry import AUTO
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
-from meshmatch.shapes.repair import turned_outwards
+from meshmatch.shapes.repair import oriented_outwards
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import thread_limit
 from meshmatch.transfer.wrap import wrap_onto
@@ -144,7 +144,7 @@ def wrap(
         hint = "mirror one of the files, or match without mirror images (--mirror no)"
         raise OptionError(f"{mesh.name or 'the base'} matches as a mirror image: it would be inside out", hint)
     with thread_limit(1):
-        wrapped = wrap_onto(turned_outwards(mesh), near.verts, turned_outwards(surface), kept, found.threads)
+        wrapped = wrap_onto(oriented_outwards(mesh), near.verts, oriented_outwards(surface), kept, found.threads)
     shape = replace(mesh, verts=wrapped.verts)
     binding = move_skeleton(original, shape, surface.upright)
     turn = turn_of_moved(mesh, shape.verts, surface, found.target_fit)

@@ -16,7 +16,7 @@ from meshmatch.outputs import folder_on_success
 from meshmatch.threads import thread_limit
 
 if TYPE_CHECKING:
-    from meshmatch.collections.atlas_files import Findings
+    from meshmatch.collections.atlas_files import AtlasResults
     from meshmatch.collections.registered import Registered
 
 
@@ -151,7 +151,7 @@ def atlas(
     modes. With --groups, also tests where two groups differ (permutation test, corrected for multiple comparisons). With
     --model, also computes how much of the variation the terms of a linear model explain, and where.
     """
-    from meshmatch.collections.atlas_files import record, write_folder
+    from meshmatch.collections.atlas_files import atlas_record, write_folder
     from meshmatch.collections.model_files import anova_rows
 
     how.check()
@@ -164,7 +164,7 @@ def atlas(
         _warn(console, made, how)
         found = _find(console, made, shapes, how)
         names = write_folder(folder, made, found, rotation=shapes.rotation, title=output.name)
-    about = record(made, found)
+    about = atlas_record(made, found)
     _report(console, about)
     for table in ("model", "asymmetry"):
         if table in about and not json and not quiet:
@@ -178,10 +178,10 @@ def _shapes(fits: str, how: AtlasOptions) -> AbstractContextManager["Registered"
     """Open the registered shapes of a folder of fits or meshes."""
     from meshmatch.collections.collection import Collection
     from meshmatch.collections.registered import registered_meshes
-    from meshmatch.collections.settle import read_about
+    from meshmatch.collections.select_setting import read_manifest
 
     collection = Collection(fits)
-    if not collection.store.remote and read_about(collection.store) is None:
+    if not collection.store.remote and read_manifest(collection.store) is None:
         if not Path(fits).is_dir():
             raise OptionError(f"{fits} is not a folder", "give the folder that `meshmatch fit` made")
         return registered_meshes(fits, how.leave_out or ())
@@ -189,23 +189,23 @@ def _shapes(fits: str, how: AtlasOptions) -> AbstractContextManager["Registered"
 
 
 def _warn(console: Console, made: Any, how: AtlasOptions) -> None:
-    from meshmatch.collections.covariates import some
-    from meshmatch.collections.registered import mixed_units, outlying
+    from meshmatch.collections.covariates import shorten_names
+    from meshmatch.collections.registered import find_outliers, mixed_units
 
     units = mixed_units(made.names, made.sizes)
     if how.scale == "keep" and units:
         console.warn(units)
-    elif len(rows := outlying(made.distances)) and not how.robust:
+    elif len(rows := find_outliers(made.distances)) and not how.robust:
         share = sum(made.scores[rows, 0] ** 2) / sum(made.scores[:, 0] ** 2)
         console.warn(
-            f"{some([made.names[k] for k in rows])}: unlike the others, and {100 * share:.0f} % of mode 1. "
+            f"{shorten_names([made.names[k] for k in rows])}: unlike the others, and {100 * share:.0f} % of mode 1. "
             "Leave out shapes that are cut, broken, mirrored or of another kind (--leave-out), or try --robust"
         )
 
 
-def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) -> "Findings":
+def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) -> "AtlasResults":
     from meshmatch.collections.asymmetry import measure_asymmetry
-    from meshmatch.collections.atlas_files import Findings
+    from meshmatch.collections.atlas_files import AtlasResults
     from meshmatch.collections.measures import measure_atlas
     from meshmatch.collections.registered import read_group
 
@@ -235,7 +235,7 @@ def _find(console: Console, made: Any, shapes: "Registered", how: AtlasOptions) 
     if how.measures and len(shapes.names) > 3:
         with console.progress() as progress:
             measures = measure_atlas(made, shapes.points, seed=how.seed, progress=progress)
-    return Findings(
+    return AtlasResults(
         measures, comparison, names, explained, how.samples, how.seed, how.format, members, asymmetry, how.align_by
     )  # fmt: skip
 

@@ -65,7 +65,7 @@ def fit(
     with the models of their kinds, in FITS/KIND. With --model none, the template is built from the shapes themselves, in
     any pose and orientation; mirror images and cut shapes are recognised. FITS/fits.csv lists the result of every shape.
     """
-    from meshmatch.collections.fit_all import elsewhere_words
+    from meshmatch.collections.fit_all import elsewhere_messages
     from meshmatch.collections.setting import FAILED, LEFT_OUT
 
     how.check()
@@ -86,7 +86,7 @@ def fit(
     console.say(f"wrote {sum(record.fitted for record in made.records)} fits to {output}{chosen}: {verdicts}")
     if others := [record.name for record in made.records if record.verdict == LEFT_OUT]:
         console.say(f"ignored, as they are not shapes: {_summarize_files(others)}; see {output}/fits.csv")
-    console.say(*elsewhere_words(made.elsewhere))
+    console.say(*elsewhere_messages(made.elsewhere))
     if counts["poor"] and not how.try_harder:
         console.say("to search longer for poor fits, run the same command with --try-harder")
     _report_distances(console, made.records, made.model)

@@ -73,21 +73,21 @@ def info(
 
 def _is_list(file: Path) -> bool:
     """Whether a .npy has one axis: it is then a map, with two axes a point cloud."""
-    from meshmatch.shapes.input_files import existing, read_npy
+    from meshmatch.shapes.input_files import check_input_file, read_npy
 
     try:
-        return read_npy(existing(file, "")).ndim == 1
+        return read_npy(check_input_file(file, "")).ndim == 1
     except InputError:
         return False  # the reader of shapes reports the error
 
 
 def _shape(file: Path) -> Json:
-    from meshmatch.shapes.files import load_shape, mesh_list
-    from meshmatch.shapes.normalise import guess_unit, long_axis
+    from meshmatch.shapes.alignment import guess_unit, long_axis
+    from meshmatch.shapes.files import list_meshes, load_shape
     from meshmatch.shapes.parts import Parts
     from meshmatch.shapes.repair import repair
 
-    meshes = mesh_list(file)  # first, so that its memory is freed before the shape is loaded
+    meshes = list_meshes(file)  # first, so that its memory is freed before the shape is loaded
     shape = load_shape(file)
     size = [float(length) for length in shape.bounds[1] - shape.bounds[0]]
     clean = repair(shape)
@@ -208,12 +208,12 @@ def _folder(file: Path) -> Json:
     """Describe a folder: the fits of a collection, an atlas, or a model."""
     import csv
 
-    from meshmatch.collections.settle import read_about
+    from meshmatch.collections.select_setting import read_manifest
     from meshmatch.collections.stores import Store
     from meshmatch.models.card import is_implicit
     from meshmatch.models.registry import CARD, read_any_card
 
-    if (about := read_about(Store.of(file))) is not None:
+    if (about := read_manifest(Store.of(file))) is not None:
         verdicts: Counter[str] = Counter()
         if (file / "fits.csv").is_file():  # it is written last
             with (file / "fits.csv").open(encoding="utf-8", newline="") as table:
@@ -233,13 +233,13 @@ def _folder(file: Path) -> Json:
 
 def _tensors(file: Path) -> Json:
     """Describe a fit or a template."""
-    from meshmatch.maps.fit_files import load_words
+    from meshmatch.maps.fit_files import read_fit_header
     from meshmatch.models.registry import CARD, WEIGHTS
 
     if file.name == WEIGHTS and file.with_name(CARD).is_file():
         raise InputError(f"{file} contains the weights of a model", f"meshmatch info {file.parent}")
     try:
-        fit, _ = load_words(file)
+        fit, _ = read_fit_header(file)
     except InputError:
         return _template(file)
     shown = ("shape", "model", "verdict", "trust", "residual", "up", "front", "partial")

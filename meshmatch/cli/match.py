@@ -105,7 +105,7 @@ def register(
     the mesh onto the surface. With more than one thread, results may differ in the last bits.
     """
     from meshmatch.api.matching import matcher_for
-    from meshmatch.api.upright import turn_of_fit
+    from meshmatch.api.upright import upright_rotation_of_fit
     from meshmatch.shapes.files import check_mesh_suffix, save_upright
 
     how.check(not_implicit=["dense", "onto", "template"])
@@ -127,7 +127,7 @@ def register(
         user_messages.raise_if_poor(run.strict, fit.verdict, fit.reasons)
         plain = meshmatch.Shape(fit.points_in_file, fit.faces, output.stem)
         fitted = matcher.dense(fit) if dense else plain  # type: ignore[arg-type]
-        turned = save_upright(temporary, fitted, None if loaded.upright else turn_of_fit(fit))
+        turned = save_upright(temporary, fitted, None if loaded.upright else upright_rotation_of_fit(fit))
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 
@@ -171,13 +171,13 @@ def _register_onto(
     """Deform the mesh of one shape onto another."""
     import numpy as np
 
-    from meshmatch.api.bound import move_skeleton
     from meshmatch.api.matching import match as match_shapes
+    from meshmatch.api.skeletons import move_skeleton
     from meshmatch.api.upright import turn_of_moved
-    from meshmatch.geometry.triangles import shortest_turns
+    from meshmatch.geometry.triangles import rotations_between
     from meshmatch.outputs import replace_all_on_success
     from meshmatch.shapes.blend_shapes import shape_normals
-    from meshmatch.shapes.moved_files import MovedFile
+    from meshmatch.shapes.deformed_files import MovedFile
 
     names = user_messages.names_of([shape, onto])
     plan = MovedFile.planned(output, shape)
@@ -198,7 +198,7 @@ def _register_onto(
         turn = turn_of_moved(a, moved.verts, b, result.target_fit)
         before, after = shape_normals(a, (moved.verts - a.verts)[None].astype(np.float32))
         binding = move_skeleton(shape, moved, b.upright)
-        plan.write(temporary, moved, shortest_turns(before, after), binding, turn)
+        plan.write(temporary, moved, rotations_between(before, after), binding, turn)
     if picture is not None:
         from meshmatch.render.compose import compose_fit
 

@@ -38,12 +38,12 @@ def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[
     """Write the measurements of all targets, and of SRC unless it is the included body, as one table."""
     import numpy as np
 
-    from meshmatch.api.measure import is_body, own_points
+    from meshmatch.api.measure import is_body, measuring_points
     from meshmatch.collections.registered import mixed_units
     from meshmatch.shapes.tables import write_rows
     from meshmatch.transfer.measurements import measured_values
 
-    points = own_points(given["source"], given["measurements"], given["landmarks"])
+    points = measuring_points(given["source"], given["measurements"], given["landmarks"])
     own = points.taken(points.points)
     values = {} if is_body(given["source"]) else {source: dict(zip(own.names, own.values.tolist(), strict=True))}
     values |= {name: measured_values(file) for name, file in written.items()}
@@ -100,7 +100,7 @@ def measure(
     """
     import numpy as np
 
-    from meshmatch.api.measure import measure_inputs, own_points
+    from meshmatch.api.measure import measure_inputs, measuring_points
     from meshmatch.transfer.measurements import check_measurements_suffix
 
     path, defined, marks = measure_inputs(source, measurements, landmarks)
@@ -126,7 +126,7 @@ def measure(
     if picture is not None:
         from meshmatch.render.compose import compose_lines
 
-        points = own_points(source, measurements, landmarks)
+        points = measuring_points(source, measurements, landmarks)
         there = np.flatnonzero(~np.isnan(found.values)).tolist()
         lines = [[each.lines[k] for k in there] for each in (points.taken(points.points), found)]
         transfer.draw(result.maps, compose_lines((result.maps.source, result.maps.target), lines))

@@ -14,7 +14,7 @@ from typer import Argument, Option
 
 from meshmatch.cli.options import check_outputs, check_writable
 from meshmatch.cli.user_messages import Console, Json, print_json
-from meshmatch.collections.endings import USUAL
+from meshmatch.collections.suffixes import DEFAULT_SUFFIXES
 from meshmatch.errors import InputError, OptionError
 from meshmatch.models.registry import check_model
 
@@ -63,7 +63,7 @@ def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], 
             if rest["run"].json:
                 print_json(record)
 
-        found = USUAL[transfer]
+        found = DEFAULT_SUFFIXES[transfer]
         usual = f"{found.suffix}{', or as TGT' if found.own else ''}" if found.suffix else "as GARMENT"
         help_text = f"With several targets, the suffix of each output. Default: {usual}."
         format_ = Option(None, "--format", metavar="SUFFIX", help=help_text)
@@ -89,8 +89,8 @@ def _transfer_all(
     verb: Verb, transfer: str, target: Sequence[Path], ending: str | None, rest: dict[str, Any], gather: Gather | None
 ) -> None:
     """Transfer to each target and print a row for each; raise in the end if a transfer failed."""
-    from meshmatch.collections.endings import ending_of
     from meshmatch.collections.setting import FAILED
+    from meshmatch.collections.suffixes import choose_suffix
     from meshmatch.collections.transfer_table import transfer_each
     from meshmatch.collections.transfers import Targets
 
@@ -111,7 +111,7 @@ def _transfer_all(
         transfer = "transfer_values"
     elif ending is not None and ending.removeprefix(".") in ("ply", "off") and transfer == "transfer_texture":
         transfer = "transfer_colors"
-    endings = ending_of(transfer, ending, garment, found.files, rest.get("join", False))
+    endings = choose_suffix(transfer, ending, garment, found.files, rest.get("join", False))
     if maps.map is None:
         check_model(maps.model)
     console = Console(run.quiet)

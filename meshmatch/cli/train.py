@@ -323,7 +323,7 @@ def _plan_explicit(
     """
     from meshmatch.models.inference import training_device
     from meshmatch.training import train as training
-    from meshmatch.training.recipes import going_on, recipe_for, small_data
+    from meshmatch.training.recipes import fine_tuning, recipe_for, small_data
 
     settings = (
         "field", "volume", "arap", "blend", "rate", "points", "steps", "minutes", "bf16", "tf32", "compile", "workers",
@@ -335,7 +335,7 @@ def _plan_explicit(
             how.refuse(("template", "identities"), "a prepared folder, which has a template and shapes of its own")
         recipe = recipe_for(how.shapes, how.preset, how.unsupervised, how.kind)
     else:
-        recipe = small_data() if start is None else going_on(start)
+        recipe = small_data() if start is None else fine_tuning(start)
     changes = {name: getattr(how, name) for name in settings}
     if how.recipe is not None:
         from meshmatch.training.recipe_files import read_recipe
@@ -384,7 +384,7 @@ def _fits(how: TrainOptions, console: Console) -> "tuple[RegisteredShapes | None
 
     (None, None) if --shapes is not a folder of fits.
     """
-    from meshmatch.collections.settle import is_collection
+    from meshmatch.collections.select_setting import is_collection
 
     if how.shapes is None or not is_collection(how.shapes):
         return None, None

@@ -44,7 +44,7 @@ def transfer_color(
     Values are interpolated within the faces of SRC. The VALUE of --blank is a number, one number per column (1,0,0), or a
     color (#ff0000).
     """
-    from meshmatch.shapes.dressed_files import tell_lost
+    from meshmatch.shapes.dressed_files import warn_about_losses
     from meshmatch.transfer import value_files
 
     if directions and values is None:
@@ -54,7 +54,7 @@ def transfer_color(
     with transfer.outputs(values) as (temporary,):
         a = meshmatch.load_shape(source)
         given = None if values is None else value_files.load_values(values, a)
-        here = value_files.light_of(a) if given is None else given.numbers
+        here = value_files.linear_colors(a) if given is None else given.numbers
         columns = 1 if here.ndim == 1 else here.shape[1]
         rule = rules.rule(None if rules.blank is None else value_files.parse_blank(rules.blank, columns).tolist())
         if given is None:
@@ -63,17 +63,19 @@ def transfer_color(
         else:
             result = meshmatch.transfer_values(a, target, given.numbers, transfer, directions=directions, rule=rule)
             found = value_files.Values(result.data, given.names)
-            tell_lost(target, output, value_files.save_values(temporary, found, result.maps.target, target))
+            warn_about_losses(target, output, value_files.save_values(temporary, found, result.maps.target, target))
     b = result.maps.target
     low = transfer.report_low(result.low, rule.minimum)
     what = "colors" if given is None else f"{columns} number{'s' if columns > 1 else ''} each"
     transfer.console.say(f"wrote {output}: {what} for the {b.V} vertices of {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_values
-        from meshmatch.shapes.colors import light, seen
+        from meshmatch.shapes.colors import linear_to_srgb_alpha, srgb_to_linear_alpha
 
         if given is None:
-            shown = compose_values((a, b), [seen(each)[:, :3] for each in (here, light(result.data))])
+            shown = compose_values(
+                (a, b), [linear_to_srgb_alpha(each)[:, :3] for each in (here, srgb_to_linear_alpha(result.data))]
+            )
         else:
             title = given.names[0] if given.names else str(values and values.stem)
             title += "" if columns == 1 else f" (the first of {columns} numbers)"
@@ -204,14 +206,14 @@ def _landmark_table(table: Path, given: Mapping[str, Any], source: str, written:
 
     from meshmatch.collections.registered import mixed_units
     from meshmatch.shapes.landmark_files import mesh_space
-    from meshmatch.transfer.landmarks import landmark_positions, load_landmarks, save_specimens, size_beside
+    from meshmatch.transfer.landmarks import landmark_positions, load_landmarks, relative_size, save_specimens
 
     path = given["source"]
     own, _ = load_landmarks(given["landmarks"], meshmatch.load_shape(path), mesh_space(path))
     specimens = {source: own.points} | {name: landmark_positions(file) for name, file in written.items()}
     with replace_on_success(table) as temporary:
         save_specimens(temporary, specimens, own.names)
-    sizes = {name: size_beside(points, own.points) for name, points in specimens.items()}
+    sizes = {name: relative_size(points, own.points) for name, points in specimens.items()}
     if units := mixed_units(
         known := [name for name, size in sizes.items() if size > 0], [sizes[name] for name in known]
     ):

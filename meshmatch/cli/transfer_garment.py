@@ -36,7 +36,7 @@ def transfer_garment(
     the skin, rotated and scaled as the body is there; vertices that would sink below the skin of TGT are pushed out. Vertex
     order, polygons, texture coordinates, groups and materials are kept. In a .glb, GARMENT moves with the skeleton of TGT.
     """
-    from meshmatch.shapes.moved_files import MovedFile
+    from meshmatch.shapes.deformed_files import MovedFile
 
     transfer = Transfer(source, target, output, maps, run, picture)
     console = transfer.console
@@ -65,9 +65,9 @@ def transfer_garment(
     written = " ".join(str(file) for file in plan.files)
     console.say(f"wrote {written}: {garment.name} on {transfer.names[1]} ({result.seconds:.1f} s)")
     if picture is not None:
-        from meshmatch.render.compose import compose_worn
+        from meshmatch.render.compose import compose_garments
 
-        transfer.draw(result.maps, compose_worn((a, b), (worn, result.shape)))
+        transfer.draw(result.maps, compose_garments((a, b), (worn, result.shape)))
     record = {"picture": picture, "files": [str(file) for file in plan.files], "vertices": worn.V}
     numbers = {"joined": join, "pushed_out": len(result.pushed), "below_skin": len(result.sunk), "sits": result.sits}
     shares = {"below_source_skin": round(result.below, 4), "far_from_source": round(result.far, 4)}

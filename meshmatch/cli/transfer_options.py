@@ -145,10 +145,10 @@ class Transfer:
 
     def draw(self, maps: MapPair, shown: Composition) -> None:
         """Draw what was transferred, on both shapes."""
-        from meshmatch.render.facing import same_side
+        from meshmatch.render.facing import rotations_to_same_side
 
         assert self.picture is not None
-        turns = same_side(maps.source, maps.target, maps.forward, maps.rotations)
+        turns = rotations_to_same_side(maps.source, maps.target, maps.forward, maps.rotations)
         shown.rotated(turns).named(self.names).render(self.picture)
         self.console.say(f"drew {self.picture}: both shapes with what was transferred")
 

@@ -86,7 +86,7 @@ def transfer_texture(
         tiles = []
     rules_of_texels = rules.min_confidence, rules.fill, blank
     baking = meshmatch.BakeOptions(size, texture.samples, texture.padding, *rules_of_texels, run.threads, tiled)
-    files = [output] if painted else textured_files.files_of(output, layers, tiles)
+    files = [output] if painted else textured_files.output_files(output, layers, tiles)
     turn = None
     with transfer.outputs(image, files=files) as temporary:
         if painted:

@@ -44,10 +44,10 @@ def wrap(
     """
     import numpy as np
 
-    from meshmatch.api.bound import move_skeleton
+    from meshmatch.api.skeletons import move_skeleton
     from meshmatch.outputs import replace_all_on_success
+    from meshmatch.shapes.deformed_files import MovedFile
     from meshmatch.shapes.files import check_mesh_suffix
-    from meshmatch.shapes.moved_files import MovedFile
 
     how.check()
     check_mesh_suffix(output)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32, frozen
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Ints32, set_read_only
 from meshmatch.collections.covariates import DesignTerm
 from meshmatch.collections.permutation import PlaceTests, orders, permuted, run_tests, whitened
 from meshmatch.errors import InputError
@@ -158,8 +158,8 @@ def analyse(
                 z=z,
                 p=p,
                 coefficients=term.coefficients,
-                change=frozen(change),
-                along_normal=frozen(np.einsum("cvi,vi->cv", change, normals)),
+                change=set_read_only(change),
+                along_normal=set_read_only(np.einsum("cvi,vi->cv", change, normals)),
                 places=places,
             )
         )

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints, frozen
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr, set_read_only
 from meshmatch.collections.anova import Effect, Variances, analyse
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.covariates import Columns, Covariates, DesignTerm, covariates, some
+from meshmatch.collections.covariates import Columns, Covariates, DesignTerm, covariates, shorten_names
 from meshmatch.collections.groups import Statistic
 from meshmatch.collections.superimpose import Superimposed
 from meshmatch.errors import InputError, OptionError
@@ -26,14 +26,14 @@ from meshmatch.geometry.frames import kabsch
 from meshmatch.maps.footpoints import Footpoints
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import laid_mirrored
+from meshmatch.templates.mirror_images import aligned_mirror_image
 
 _ROUNDS = 10
 _MAX_ASYMMETRY = 0.015  # largest rms distance of a symmetric mean from its mirror image, in sqrt(area)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Asymmetry(Brief):
+class Asymmetry(ShortRepr):
     """Differences of shapes from their mirror images, or of one side from the other.
 
     Attributes
@@ -148,18 +148,18 @@ def measure_asymmetry(
         measured = analysed(differences - differences.mean(axis=0), [_term(owner, names)], None)
         scatter = float(np.square(within).sum(axis=(0, 1, 3)) @ weights)
         found = _add_error(found, measured.effects[0], scatter, counts)
-        error = frozen(_spread(within[:, 0] - within[:, 1], len(owner) - len(names)))
+        error = set_read_only(_spread(within[:, 0] - within[:, 1], len(owner) - len(names)))
     differences = means[:, 0] - means[:, 1]
     deviations = differences - differences.mean(axis=0)
     return Asymmetry(
         names=names,
         of_mean=_rms(differences.mean(axis=0), weights) if given.of_mean is None else given.of_mean,
         directional=found.effects[1],
-        fluctuating=frozen(_spread(deviations, len(names) - 1)),
+        fluctuating=set_read_only(_spread(deviations, len(names) - 1)),
         error=error,
         table=found,
-        total_of=frozen(np.array([_rms(each, weights) for each in differences])),
-        fluctuating_of=frozen(np.array([_rms(each, weights) for each in deviations])),
+        total_of=set_read_only(np.array([_rms(each, weights) for each in differences])),
+        fluctuating_of=set_read_only(np.array([_rms(each, weights) for each in deviations])),
         matching=sides is not None,
     )
 
@@ -206,7 +206,7 @@ def _pair_sides(atlas: Atlas, labels: Sequence[str], column: str, cells: Sequenc
     levels = sorted(set(cells))
     if len(levels) != 2:
         raise InputError(
-            f"{column} has {len(levels)} values ({some(levels)})", "two are needed, such as left and right"
+            f"{column} has {len(levels)} values ({shorten_names(levels)})", "two are needed, such as left and right"
         )
     names, owner, order = _number_individuals(labels)
     second = np.array([cell == levels[1] for cell in cells], bool)
@@ -214,7 +214,7 @@ def _pair_sides(atlas: Atlas, labels: Sequence[str], column: str, cells: Sequenc
     if not np.array_equal(*(owner[each] for each in rows)):
         unlike = np.bincount(owner[second], minlength=len(names)) != np.bincount(owner[~second], minlength=len(names))
         raise InputError(
-            f"{some([names[k] for k in np.flatnonzero(unlike)])}: not as many {levels[1]} as {levels[0]} ones",
+            f"{shorten_names([names[k] for k in np.flatnonzero(unlike)])}: not as many {levels[1]} as {levels[0]} ones",
             "each individual needs both; --leave-out (`leave_out`) leaves out shapes",
         )
     points = (atlas.mean + atlas.offsets(atlas.scores))[np.stack(rows, axis=1)]
@@ -225,7 +225,7 @@ def _cells(known: Covariates, column: str) -> tuple[str, ...]:
     """The cells of a column; `InputError` if any is missing."""
     lacking = known.missing(column)
     if lacking.any():
-        names = some([known.names[k] for k in np.flatnonzero(lacking)])
+        names = shorten_names([known.names[k] for k in np.flatnonzero(lacking)])
         raise InputError(f"{names}: {column} is missing", "fill it in, or leave these shapes out of the atlas")
     return known.column(column)
 
@@ -292,7 +292,7 @@ class _MirrorMap:
     """The point of the mean's surface that lies across the plane of symmetry from each vertex."""
 
     def __init__(self, mean: Shape, weights: Float[Floats, " V"], seed: int) -> None:
-        image = laid_mirrored(mean, seed)
+        image = aligned_mirror_image(mean, seed)
         self._faces = image.faces
         normals = mean.vertex_normals
         for _ in range(_ROUNDS):

@@ -11,7 +11,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints, Pickled, as_numbers, frozen
+from meshmatch.arrays import Float, Floats, Int, Ints, PickledFields, ShortRepr, as_numbers, set_read_only
 from meshmatch.collections.atlas_arrays import load_arrays, save_arrays
 from meshmatch.collections.covariates import Columns, covariates
 from meshmatch.collections.explain import Explained, explain
@@ -24,7 +24,7 @@ from meshmatch.shapes.shape import Shape
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Projection(Brief):
+class Projection(ShortRepr):
     """A shape projected onto the modes of an atlas.
 
     ``scores`` (M,) are in standard deviations. ``shape`` is the reconstruction from the scores, and ``distance`` (V,) the
@@ -39,7 +39,7 @@ class Projection(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Atlas(Brief, Pickled):
+class Atlas(ShortRepr, PickledFields):
     """The mean of S registered shapes, and the M modes in which they vary.
 
     Attributes
@@ -165,11 +165,11 @@ class Atlas(Brief, Pickled):
         signed_modes, scores = sign[:, None, None] * found.modes, sign * found.scores
         sizes = np.concatenate([alignment.poses(some).sizes for _, some in iter_blocks(points)])
         for array in (mean, signed_modes, found.deviations, scores, sizes, faces, alignment.weights):
-            frozen(array)
+            set_read_only(array)
         return cls(
             mean=mean, modes=signed_modes, deviations=found.deviations, scores=scores, sizes=sizes, faces=faces,
             weights=alignment.weights, names=shape_names, total=found.total, scale=scale, robust=robust, template=template,
-            groups=None if alignment.groups is None else frozen(alignment.groups),
+            groups=None if alignment.groups is None else set_read_only(alignment.groups),
         )  # fmt: skip
 
     @property

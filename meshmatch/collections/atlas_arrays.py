@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from meshmatch.arrays import frozen
+from meshmatch.arrays import set_read_only
 from meshmatch.collections.superimpose import MAX_GROUPS, Scale
 from meshmatch.errors import InputError
 from meshmatch.outputs import replace_on_success
@@ -75,7 +75,7 @@ def _validated(file: Path, given: dict[str, Any]) -> dict[str, Any]:
         invalid = [name for name, holds in checks.items() if not holds]
     if invalid:
         raise InputError(f"{file} is damaged: {', '.join(invalid)}", "make it again")
-    found: dict[str, Any] = {name: frozen(array) for name, array in (given | numbers).items()}
+    found: dict[str, Any] = {name: set_read_only(array) for name, array in (given | numbers).items()}
     words = {"names": tuple(map(str, given["names"])), "scale": str(given["scale"]), "template": str(given["template"])}
     return found | words | {"total": float(given["total"]), "robust": bool(given["robust"])}
 

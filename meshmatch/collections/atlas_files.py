@@ -64,11 +64,11 @@ from meshmatch.collections.model_files import (
     write_model,
 )
 from meshmatch.collections.named_parts import WHOLE
-from meshmatch.collections.registered import outlying
-from meshmatch.render.facing import facing
+from meshmatch.collections.registered import find_outliers
+from meshmatch.render.facing import guess_rotation
 from meshmatch.render.viewer.single_pages import Varying, write_atlas_page
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats.gltf_out import write_morphs
+from meshmatch.shapes.formats.gltf_write import write_morphs
 from meshmatch.shapes.formats.vtk import write_vtp
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
@@ -80,7 +80,7 @@ _BLOCK = 64  # shapes processed at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class AtlasResults:
     """Results of analyses of an atlas, None for those that were not requested; and options of the output.
 
     ``groups`` are the names of the two compared groups, and ``members`` maps the names of shapes to the group of each.
@@ -110,7 +110,7 @@ class Findings:
 def write_folder(
     folder: Path,
     atlas: Atlas,
-    findings: Findings = Findings(),
+    findings: AtlasResults = AtlasResults(),
     *,
     rotation: Float[Floats, "3 3"] | None = None,
     title: str = "atlas",
@@ -120,7 +120,7 @@ def write_folder(
     ``rotation`` turns the mean to y up and z to the front; it is guessed if not given. `OutputError` if a file cannot be
     written.
     """
-    turn = facing(atlas.mean_shape) if rotation is None else rotation
+    turn = guess_rotation(atlas.mean_shape) if rotation is None else rotation
     atlas.save(folder / FILE)
     save_shape(folder / "mean.ply", atlas.mean_shape)
     _write_mean(folder / "mean.vtp", atlas)
@@ -142,7 +142,7 @@ def write_folder(
     if findings.asymmetry is not None:
         write_asymmetry(folder, atlas.mean_shape, findings.asymmetry)
         draw_asymmetry(folder, atlas.mean_shape, findings.asymmetry, turn)
-    (folder / "atlas.json").write_text(json.dumps(record(atlas, findings), indent=1) + "\n", encoding="utf-8")
+    (folder / "atlas.json").write_text(json.dumps(atlas_record(atlas, findings), indent=1) + "\n", encoding="utf-8")
     draw_modes(folder / "modes.png", atlas, turn)
     draw_distances(folder / "distances.png", atlas, turn)
     if find_spec("matplotlib") is not None:
@@ -169,7 +169,7 @@ def _figures(folder: Path) -> list[Path]:
     return sorted(path for path in shown if path.stem not in _NOT_ON_PAGE)
 
 
-def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
+def atlas_record(atlas: Atlas, findings: AtlasResults) -> dict[str, Any]:
     """Summary of an atlas and of the analyses, as JSON values."""
     found: dict[str, Any] = {
         "shapes": len(atlas.names),
@@ -180,7 +180,7 @@ def record(atlas: Atlas, findings: Findings) -> dict[str, Any]:
         "robust": atlas.robust,
         "deviations": rounded(atlas.deviations),
         "compactness": rounded(atlas.compactness),
-        "outliers": [atlas.names[k] for k in outlying(atlas.distances)],
+        "outliers": [atlas.names[k] for k in find_outliers(atlas.distances)],
         "furthest": {atlas.names[k]: rounded(atlas.distances[k]) for k in furthest(atlas)},
         "samples": findings.samples,
         "seed": findings.seed,

@@ -17,7 +17,7 @@ from meshmatch.collections.groups import Comparison
 from meshmatch.collections.measures import Measures
 from meshmatch.collections.model_files import LEVEL
 from meshmatch.collections.permutation import PlaceTests
-from meshmatch.render.charts import Dots, draw_beside, draw_dots, draw_histogram, draw_scree
+from meshmatch.render.charts import Dots, draw_dots, draw_histogram, draw_panels, draw_scree
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, draw_apart, render_shapes
 from meshmatch.render.scales import Scale, nice_step
@@ -173,7 +173,7 @@ def draw_charts(folder: Path, atlas: Atlas, measures: Measures | None, kind: Cha
     for name, title in both.items():
         lines = {"points": getattr(measures, name), "surfaces": getattr(measures, f"{name}_surface")}
         charts[f"{name}: {title}"] = (unit, {key: (x, values.tolist()) for key, values in lines.items()})
-    draw_beside(charts, folder / f"measures.{kind}", "modes")
+    draw_panels(charts, folder / f"measures.{kind}", "modes")
 
 
 def draw_scores(

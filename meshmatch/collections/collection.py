@@ -15,13 +15,13 @@ from meshmatch.api.results import MapPair
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.export import Export, Exported, Fits, Place, export
-from meshmatch.collections.fit_all import Fitted, elsewhere_words, file_table, fit_all, fit_all_kinds, with_left_out
+from meshmatch.collections.fit_all import Fitted, elsewhere_messages, file_table, fit_all, fit_all_kinds, with_left_out
 from meshmatch.collections.folder import FitsFolder
 from meshmatch.collections.map_all import Pair, map_all
 from meshmatch.collections.named_parts import WHOLE, Masks, parts_of_template
 from meshmatch.collections.registered import Registered, load_points, match_names
+from meshmatch.collections.select_setting import select_setting
 from meshmatch.collections.setting import Record, Setting, clear_caches, read_template
-from meshmatch.collections.settle import select_setting
 from meshmatch.collections.sources import find_sources, frame_times, sort_by_sequence
 from meshmatch.collections.stores import Store
 from meshmatch.collections.superimpose import Scale, superimpose
@@ -29,10 +29,10 @@ from meshmatch.collections.workers import open_workers
 from meshmatch.errors import InputError, warn
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.maps.build import map_of_placed
+from meshmatch.maps.build import map_between_fits
 from meshmatch.maps.files import check_suffix
 from meshmatch.maps.places import Places
-from meshmatch.maps.unfold_pair import both_unfolded
+from meshmatch.maps.unfold_pair import unfold_both
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.progress import ProgressCallback
@@ -148,7 +148,7 @@ class Collection(FitsFolder):
         left = [name for name in found if name not in elsewhere]
         if not left:
             what = f"{self.store.location} holds no fit of its own kind"
-            raise InputError(what, "; ".join(elsewhere_words(elsewhere)))
+            raise InputError(what, "; ".join(elsewhere_messages(elsewhere)))
         return left
 
     @property
@@ -227,7 +227,7 @@ class Collection(FitsFolder):
         VertexMap
             From source to target.
         """
-        return map_of_placed(self._read_fit(source), self._read_fit(target))
+        return map_between_fits(self._read_fit(source), self._read_fit(target))
 
     def maps_between(self, source: ShapeLike, target: ShapeLike) -> MapPair:
         """The maps between two shapes in both directions, together with the shapes, for transfers and `evaluate`.
@@ -263,7 +263,7 @@ class Collection(FitsFolder):
         a, b = (names[shape.hash] for shape in shapes)
         there, back = self.map(a, b).for_shapes(*shapes), self.map(b, a).for_shapes(*shapes[::-1])
         part = self._metadata(a)["partial"] or self._metadata(b)["partial"]
-        there, back = both_unfolded(there, back, *shapes, part)
+        there, back = unfold_both(there, back, *shapes, part)
         return MapPair(*shapes, there, opposite=back)
 
     def holds(self, shape: ShapeLike) -> bool:
@@ -285,7 +285,7 @@ class Collection(FitsFolder):
     def _names_with_warning(self) -> list[str]:
         """Return `names`, with a warning about shapes of another kind."""
         names = self.names
-        for text in elsewhere_words(self._fitted_elsewhere(sorted(set(self._fitted) - set(names)))):
+        for text in elsewhere_messages(self._fitted_elsewhere(sorted(set(self._fitted) - set(names)))):
             warn(text)
         return names
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshmatch.collections.setting import FAILED, Record
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.usual import WEIGHTS, Usual, Weights, have_sides
+from meshmatch.fitting.reference_statistics import TRUST_WEIGHTS, Usual, Weights, have_sides
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Compared:
     scale: float
 
     @classmethod
-    def of(cls, records: Sequence[Record], weights: Weights = WEIGHTS) -> Compared | None:
+    def of(cls, records: Sequence[Record], weights: Weights = TRUST_WEIGHTS) -> Compared | None:
         """Estimate from records; None for too few fits, or fits by a version that did not record stretch."""
         some = [each for each in records if each.stretch > 0 and each.residual > 0]
         usual = Usual.of([(each.stretch, each.residual) for each in some], weights)

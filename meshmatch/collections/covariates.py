@@ -15,7 +15,7 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.collections.formula import Factor, Formula, term_name
 from meshmatch.errors import InputError, OptionError
-from meshmatch.shapes.tables import is_missing, is_number, number, read_by_suffix, read_table
+from meshmatch.shapes.tables import is_missing, is_number, parse_number, read_by_suffix, read_table
 
 Columns: TypeAlias = Mapping[str, Sequence[Any]]
 """Values of the shapes, by the name of the column; in any order if there is a column ``name``, else in the shapes' order."""
@@ -37,7 +37,9 @@ class Covariates:
         """The cells of a column; `InputError` if there is no such column."""
         if name not in self.cells:
             close = get_close_matches(name, self.cells, n=1)
-            known = f"there are: {some(list(self.cells))}" if len(self.cells) > 1 else "give a table that has it"
+            known = (
+                f"there are: {shorten_names(list(self.cells))}" if len(self.cells) > 1 else "give a table that has it"
+            )
             raise InputError(f"there is no column called {name}", f"did you mean {close[0]}?" if close else known)
         return self.cells[name]
 
@@ -98,11 +100,11 @@ def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: 
 def _read_table_file(path: Path) -> tuple[list[str], list[list[str]]]:
     """Read the header and the rows of a file."""
     table = read_table(path)
-    table.check_no_doubt()
+    table.check_unambiguous()
     header, *rows = table.rows() or [[]]
     if len(header) < 2 or not rows:
         raise InputError("it has no rows, or one column only", "write a row for each shape, commas between the cells")
-    table.check_marks(rows)
+    table.check_decimal_marks(rows)
     duplicate = next((title for title, count in Counter(header).items() if count > 1), None)
     if duplicate is not None:
         raise InputError(f"two columns are called {duplicate or 'nothing'}", "the first row has the names of columns")
@@ -140,11 +142,11 @@ def _match_rows(known: Sequence[str], names: Sequence[str], what: str) -> list[i
     if unmatched:
         close = get_close_matches(unmatched[0], known, n=1)
         hint = f"is {close[0]} meant for {unmatched[0]}?" if close else "its first column, or 'name', names the shapes"
-        raise InputError(f"{what} has no row for {some(unmatched)}", hint)
+        raise InputError(f"{what} has no row for {shorten_names(unmatched)}", hint)
     return [rows[name] for name in names]
 
 
-def some(names: Sequence[str]) -> str:
+def shorten_names(names: Sequence[str]) -> str:
     """List the first names, and the number of others."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return f"{', '.join(names[:_MAX_NAMES])}{more}"
@@ -184,7 +186,7 @@ def _code_factor(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, 
     """Columns of a factor, the name of each, and a description of how the factor was interpreted."""
     cells = known.column(factor.column)
     if factor.function != "factor" and _are_numbers(cells):
-        values = np.array([number(cell) for cell in cells])
+        values = np.array([parse_number(cell) for cell in cells])
         fine = np.abs(values) < _LARGEST
         if not fine.all():
             name = known.names[int(np.argmin(fine))]

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, frozen
+from meshmatch.arrays import Float, Floats, set_read_only
 from meshmatch.collections.anova import Variances, analyse
 from meshmatch.collections.covariates import SIZE, Covariates, DesignTerm, complete_rows, design_terms
 from meshmatch.collections.formula import Factor, parse
@@ -146,7 +146,9 @@ def _allometry(
     residual = points - np.outer(points @ common, common)
     fitted = points - _residuals(points, [term.columns for term in terms])
     scores = [points @ common, points @ regression, _first_component(fitted, x), _first_component(residual, x)]
-    return Allometry(str(size), frozen(x), frozen(offsets(common[None])[0]), *(frozen(each) for each in scores))
+    return Allometry(
+        str(size), set_read_only(x), set_read_only(offsets(common[None])[0]), *(set_read_only(each) for each in scores)
+    )
 
 
 def _residuals(values: Float[Floats, "S N"], columns: list[Float[Floats, "S C"]]) -> Float[Floats, "S N"]:

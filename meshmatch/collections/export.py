@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from meshmatch.api.upright import turn_of_fit
+from meshmatch.api.upright import upright_rotation_of_fit
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.collections.covariates import SIZE, Covariates, covariates
 from meshmatch.collections.motion import area_strain, smooth_frames
@@ -29,7 +29,7 @@ from meshmatch.outputs import as_path, folder_on_success, make_folder
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import load_shape, save_upright
 from meshmatch.shapes.formats import gltf
-from meshmatch.shapes.formats.gltf_out import write_morphs
+from meshmatch.shapes.formats.gltf_write import write_morphs
 from meshmatch.shapes.formats.vtk import write_vtk, write_vtp
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
@@ -166,7 +166,7 @@ def export(
             metadata.add(name, fit)
             if how.place == "files":
                 is_upright = Path(fits.files.get(name, "")).suffix.lower() in gltf.SUFFIXES
-                rotations.setdefault(orientation_key(name), None if is_upright else turn_of_fit(fit))
+                rotations.setdefault(orientation_key(name), None if is_upright else upright_rotation_of_fit(fit))
             yield name, mesh_of(fit, how.place)
             if progress is not None:
                 progress("exporting", name, (number + 1) / len(names))

@@ -11,15 +11,16 @@ from types import MappingProxyType
 
 from meshmatch.arrays import Floats
 from meshmatch.collections.compare import Compared, opposite_side_names
+from meshmatch.collections.select_setting import rebase_on_mean, save_text, select_setting, subsample
 from meshmatch.collections.setting import (
     AGREEING,
-    ALONE,
     FAILED,
     FIRST,
     FITS,
     LEFT_OUT,
     SECOND,
     SECOND_TEMPLATE,
+    SINGLE_FITS,
     SUFFIX,
     TEMPLATE,
     Record,
@@ -27,7 +28,6 @@ from meshmatch.collections.setting import (
     Source,
     digest_of,
 )
-from meshmatch.collections.settle import rebase_on_mean, save_text, select_setting, subsample
 from meshmatch.collections.sources import natural_key
 from meshmatch.collections.stores import Store
 from meshmatch.collections.tasks import (
@@ -47,9 +47,9 @@ from meshmatch.collections.tasks import (
 )
 from meshmatch.collections.workers import DeadWorkerError, Item, Result, Workers
 from meshmatch.errors import InputError, warn
-from meshmatch.fitting.solve.agreement import AgreeConfig, held_mean, log_stretch, stretch_of
-from meshmatch.fitting.usual import FAIR
-from meshmatch.fitting.without_model import stand_alike
+from meshmatch.fitting.reference_statistics import MIN_FAIR_TRUST
+from meshmatch.fitting.solve.agreement import AgreeConfig, damped_mean, log_stretch, stretch_of
+from meshmatch.fitting.without_model import has_template_pose
 from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import plain_text
@@ -162,7 +162,7 @@ def _refine_mean_template(run: _Run, names: Sequence[str]) -> Setting:
         chosen = [source for source in run.sources if source.name in set(names)]
         again = replace(run, setting=setting, sources=chosen).fit_alone(None, SECOND)
         sound = [each for each in again if each.fitted and each.verdict != "poor"]
-        alike = sum(stand_alike(each.residual, each.stretch) for each in sound)
+        alike = sum(has_template_pose(each.residual, each.stretch) for each in sound)
         names = [each.name for each in sound]
     fine = alike > _MIN_ALIKE * len(names) and not setting.sequence
     return rebase_on_mean(setting, names, SECOND, TEMPLATE, fine=fine)
@@ -255,7 +255,7 @@ def file_table(store: Store) -> dict[str, str]:
         raise InputError(f"{store.location}/{TABLE} cannot be read", "run `meshmatch fit` again") from error
 
 
-def elsewhere_words(elsewhere: Mapping[str, str]) -> list[str]:
+def elsewhere_messages(elsewhere: Mapping[str, str]) -> list[str]:
     """Return one message per folder of fits of another kind, with the names of the shapes fitted there."""
     lines = []
     for where in dict.fromkeys(elsewhere.values()):
@@ -301,7 +301,7 @@ class _Run:
     def fit_alone(
         self,
         tell: Callable[[Record], None] | None,
-        folder: str = ALONE,
+        folder: str = SINGLE_FITS,
         opposite: Set[str] = frozenset(),
         cut: Mapping[str, float] = MappingProxyType({}),
     ) -> list[Record]:
@@ -321,7 +321,9 @@ class _Run:
                 source = self.sources[number]
                 how = source.name in opposite, cut.get(source.name)
                 tasks.append(FitTask(self.setting, source, last, folder, *how))
-            for index, result in self._map(fit_alone, tasks, "fitting" if folder == ALONE else "choosing the template"):
+            for index, result in self._map(
+                fit_alone, tasks, "fitting" if folder == SINGLE_FITS else "choosing the template"
+            ):
                 source = self.sources[numbers[index]]
                 if isinstance(result, DeadWorkerError):
                     result = Record(source.name, source.path, reasons=result.message)
@@ -388,7 +390,7 @@ class _Run:
             if step < steps:
                 mean = total / count
                 if step > 0:
-                    mean = held_mean(log_stretch(load_array(store, first)), mean, how)
+                    mean = damped_mean(log_stretch(load_array(store, first)), mean, how)
                 save_array(store, common, stretch_of(mean))
 
     def finish(self, tasks: Mapping[int, FinishTask]) -> Iterator[tuple[int, Finished]]:
@@ -410,7 +412,7 @@ def _with_outcome(alone: Record, done: Finished) -> Record:
 
 def _is_credible(record: Record, usual: Compared | None) -> bool:
     """Whether a fit is not poor, neither by itself nor by comparison with the others."""
-    return record.verdict not in ("poor", FAILED) and (usual is None or usual.trust(record) >= FAIR)
+    return record.verdict not in ("poor", FAILED) and (usual is None or usual.trust(record) >= MIN_FAIR_TRUST)
 
 
 def _write_table(store: Store, records: Sequence[Record]) -> None:

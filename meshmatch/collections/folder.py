@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from meshmatch.collections.fit_all import TABLE, file_table
+from meshmatch.collections.select_setting import read_manifest
 from meshmatch.collections.setting import FITS, SUFFIX, Source, read_finished_fit
-from meshmatch.collections.settle import read_about
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
-from meshmatch.maps.fit_files import load_words
+from meshmatch.maps.fit_files import read_fit_header
 from meshmatch.maps.places import PlacedFit
 
 
@@ -49,7 +49,7 @@ class FitsFolder:
         """Collections in subfolders, with fits of shapes of other kinds."""
         found = [name.split("/") for name in self.store.names() if name.endswith(f"/{TABLE}")]
         others = [type(self)(f"{self.store.location}/{parts[0]}") for parts in found if len(parts) == 2]
-        return [each for each in others if each.store.names(FITS) and read_about(each.store) is not None]
+        return [each for each in others if each.store.names(FITS) and read_manifest(each.store) is not None]
 
     def _fitted_elsewhere(self, names: Sequence[str]) -> dict[str, str]:
         """Map shapes of another kind to the folder of their own fits; their fits in this folder are poor."""
@@ -70,11 +70,11 @@ class FitsFolder:
     def _metadata(self, name: str) -> dict[str, Any]:
         """Metadata of a fit, such as verdict and model."""
         with self.store.reading(f"{FITS}/{name}{SUFFIX}") as path:
-            return load_words(path)[0]
+            return read_fit_header(path)[0]
 
     def _manifest(self) -> dict[str, Any]:
-        """Model and options of the collection, see `read_about`; `InputError` if the folder is not a collection."""
-        about = read_about(self.store)
+        """Model and options of the collection, see `read_manifest`; `InputError` if the folder is not a collection."""
+        about = read_manifest(self.store)
         if about is None:
             hint = "make one with `meshmatch fit SHAPES -o FOLDER`"
             raise InputError(f"{self.store.location} is not a folder of fits", hint)

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, frozen
+from meshmatch.arrays import Bool, Bools, Float, Floats, ShortRepr, set_read_only
 from meshmatch.collections.permutation import TIE_TOLERANCE, run_tests, whitened
 from meshmatch.errors import OptionError
 
@@ -22,7 +22,7 @@ _CHUNK = 2_000_000  # array elements processed at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Comparison(Brief):
+class Comparison(ShortRepr):
     """Differences between two groups of shapes, A and B.
 
     Attributes
@@ -103,8 +103,8 @@ def compare_groups(
     gaps = np.einsum("ps,st,pt->p", coefficients, products, coefficients, optimize=True)
     difference = np.tensordot(coefficients[0], offsets, 1)
     return Comparison(
-        kind, frozen(difference), frozen(np.einsum("vi,vi->v", difference, normals)), frozen(found.statistic),
-        frozen(found.p), frozen(found.p_corrected), frozen(found.p_fdr),
+        kind, set_read_only(difference), set_read_only(np.einsum("vi,vi->v", difference, normals)),
+        set_read_only(found.statistic), set_read_only(found.p), set_read_only(found.p_corrected), set_read_only(found.p_fdr),
         float((gaps >= gaps[0] * (1 - TIE_TOLERANCE)).mean()), len(labels), exact, seed, (S - second, second),
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from meshmatch.collections.setting import FITS, SUFFIX, read_finished_fit
 from meshmatch.collections.stores import Store
 from meshmatch.collections.workers import DeadWorkerError, Workers
 from meshmatch.errors import InputError
-from meshmatch.maps.build import map_of_placed
+from meshmatch.maps.build import map_between_fits
 from meshmatch.maps.files import save_map
 from meshmatch.outputs import as_path
 from meshmatch.progress import ProgressCallback
@@ -68,7 +68,7 @@ def write_maps(task: MapTask) -> int:
     """Write the maps of a task, except those that are newer than the fits; return their number, kept ones included."""
     for source in task.sources:
         if not _is_up_to_date(task, source):
-            found = map_of_placed(read_finished_fit(task.fits, source), read_finished_fit(task.fits, task.target))
+            found = map_between_fits(read_finished_fit(task.fits, source), read_finished_fit(task.fits, task.target))
             with task.output.writing(task.file(source)) as path:
                 save_map(path, found)
     return len(task.sources)

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.modes import inner_products, principal_components, rounding_variance, weighted_sums
 from meshmatch.collections.superimpose import Shapes, Superimposed
@@ -35,7 +35,7 @@ _NEAREST = 2  # shapes nearest by points to a random shape, to which its surface
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measures(Brief):
+class Measures(ShortRepr):
     """The three measures for K numbers of modes; distances are means over the surface, in the unit of the shapes.
 
     Attributes

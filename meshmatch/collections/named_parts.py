@@ -13,7 +13,7 @@ from meshmatch.collections.superimpose import MAX_GROUPS
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.places import Places
-from meshmatch.shapes.files import mesh_list
+from meshmatch.shapes.files import list_meshes
 from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
@@ -78,7 +78,7 @@ def groups_of(shape: Shape, by: str, named: Callable[[], Masks]) -> Int[Ints, " 
 
 def parts_of_file(path: str | Path) -> _LabelMasks:
     """Masks of the meshes of a file, by name; empty for formats without names."""
-    meshes = mesh_list(path)
+    meshes = list_meshes(path)
     numbers = {name: k for k, name in enumerate(dict.fromkeys(name for name, _ in meshes))}
     each = np.array([(numbers[name], count) for name, count in meshes], np.int64).reshape(-1, 2)
     return _LabelMasks(list(numbers), np.repeat(*each.T))

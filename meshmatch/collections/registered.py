@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.covariates import some
+from meshmatch.collections.covariates import shorten_names
 from meshmatch.collections.named_parts import WHOLE, Masks, groups_of, parts_of_file
 from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError, warn
@@ -38,7 +38,7 @@ _LIST_HINT = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Registered(Brief):
+class Registered(ShortRepr):
     """S shapes with the same vertices and faces, and their names.
 
     ``rotation`` turns them to y up and z to the front; None if that is not known. ``left_out`` maps names of shapes that
@@ -67,7 +67,8 @@ class Registered(Brief):
         """
         if self.cut:
             warn(
-                f"{some(self.cut)}: cut, among whole shapes: what is missing was guessed, see --leave-out (`leave_out`)"
+                f"{shorten_names(self.cut)}: cut, among whole shapes: what is missing was guessed, "
+                "see --leave-out (`leave_out`)"
             )
         groups = groups_of(Shape(self.points[0], self.faces), align_by, self.parts)
         return Atlas.of(
@@ -191,7 +192,7 @@ def mixed_units(names: Sequence[str], sizes: Sequence[float] | Floats) -> str:
     return f"{large} is {words} times as large as {small}: do the files have one unit?"
 
 
-def outlying(distances: Float[Floats, " S"]) -> Int[Ints, " N"]:
+def find_outliers(distances: Float[Floats, " S"]) -> Int[Ints, " N"]:
     """Rows of shapes that are so far from the mean, compared with most, that they are probably cut or of another kind.
 
     One in thirty collections of normal shapes has a false positive. Empty for fewer than eight shapes.

@@ -10,15 +10,15 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
-from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.inputs import as_model, repair_or_raise
 from meshmatch.api.matcher import Matcher
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError
-from meshmatch.fitting.alike import as_part
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.fitting.fitter import may_show_part
+from meshmatch.fitting.fitter import may_be_part
 from meshmatch.fitting.judge.calibration import CALIBRATION, calibration_of
+from meshmatch.fitting.same_pose import fit_as_part
 from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.maps.fit_files import StoredFit, read_fit
 from meshmatch.maps.places import PlacedFit
@@ -29,7 +29,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, load_template
 from meshmatch.threads import thread_limit
 
-FIRST, SECOND, ALONE, AGREEING, FITS = "first", "second", "alone", "agreeing", "fits"
+FIRST, SECOND, SINGLE_FITS, AGREEING, FITS = "first", "second", "alone", "agreeing", "fits"
 """Subfolders of a collection: fits to the first and to the second template (without a model); fits before the agreement;
 intermediate results of the agreement; and finished fits."""
 TEMPLATE, FIRST_TEMPLATE, SECOND_TEMPLATE = "template.safetensors", "first.safetensors", "second.safetensors"
@@ -170,17 +170,17 @@ class Setting:
         with the opposite handedness to that of the first template's fit.
         """
         if self.model == NO_MODEL:
-            part, start, mirror = validated(shape), self._find_start(shape.name), self.config.mirror != "no"
-            whole = whole if may_show_part(part.shape, self.config) else None
+            part, start, mirror = repair_or_raise(shape), self._find_start(shape.name), self.config.mirror != "no"
+            whole = whole if may_be_part(part.shape, self.config) else None
             with thread_limit(1):
                 found = fit_without_model(
                     self.template, part.shape, start=start, mirror=mirror, other_side=other_side, whole=whole
                 )
             return replace(found, repaired=part)
         if whole is not None:
-            part = validated(shape)
+            part = repair_or_raise(shape)
             with thread_limit(1):
-                cut = may_show_part(part.shape, self.config) and as_part(self.trained, part.shape, whole, self.config)
+                cut = may_be_part(part.shape, self.config) and fit_as_part(self.trained, part.shape, whole, self.config)
             if cut:
                 return replace(cut, repaired=part)
         matcher = Matcher(self.trained, self.config, 1)

@@ -13,7 +13,7 @@ from typing import Any
 
 from meshmatch.errors import InputError, OutputError, needs
 from meshmatch.locks import locked
-from meshmatch.outputs import as_path, make_folder, sweep
+from meshmatch.outputs import as_path, make_folder, remove_leftovers
 
 LOCK = ".lock"
 
@@ -88,7 +88,7 @@ class Store:
         make_folder(folder)
         busy = f"another process writes to {self.location}"
         with locked(folder / LOCK, busy, "let it end, or choose another folder"):
-            sweep(folder)
+            remove_leftovers(folder)
             yield
 
     def exists(self, name: str) -> bool:

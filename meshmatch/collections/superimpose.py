@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.shapes.shape import LARGEST
@@ -32,7 +32,7 @@ _MAX_ROUNDS, _TOLERANCE = 200, 1e-10  # iterations; change of the consensus at w
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Poses(Brief):
+class Poses(ShortRepr):
     """Transformations of G groups of vertices of S shapes: ``factor * rotation (point - center) + place``.
 
     ``sizes`` are root mean square distances from the centers of the groups, in the unit of the shapes, before scaling.
@@ -75,7 +75,7 @@ class Poses(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Superimposed(Brief):
+class Superimposed(ShortRepr):
     """The result of a superimposition, with which further shapes can be aligned.
 
     ``consensus`` is the mean (or spatial median) of the aligned shapes, and ``weights`` (V,) are those of the vertices,

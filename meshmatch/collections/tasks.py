@@ -15,21 +15,21 @@ from typing import Any
 
 import numpy as np
 
-from meshmatch.api.inputs import validated
-from meshmatch.api.kinds import other_kind
+from meshmatch.api.inputs import repair_or_raise
+from meshmatch.api.kinds import differing_kind
 from meshmatch.arrays import Float, Floats
 from meshmatch.collections.compare import Compared
-from meshmatch.collections.setting import AGREEING, ALONE, FITS, SUFFIX, Record, Setting, Source, digest_of
+from meshmatch.collections.setting import AGREEING, FITS, SINGLE_FITS, SUFFIX, Record, Setting, Source, digest_of
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError
-from meshmatch.fitting.agree import member_of, with_vectors
-from meshmatch.fitting.alike import is_finer
-from meshmatch.fitting.fitter import side_words
+from meshmatch.fitting.agree import make_member, with_vectors
+from meshmatch.fitting.fitter import mirror_note
 from meshmatch.fitting.judge.calibration import calibration_of
+from meshmatch.fitting.same_pose import is_refined
 from meshmatch.fitting.solve.agreement import AgreeConfig, Member, agree_step, log_stretch
 from meshmatch.fitting.solve.regularity import Regularity
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.maps.fit_files import StoredFit, load_words, regularity_of, write_fit
+from meshmatch.maps.fit_files import StoredFit, read_fit_header, regularity_of, write_fit
 from meshmatch.maps.places import PlacedFit, Places, surface_distance
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import replace_on_success
@@ -44,7 +44,7 @@ class FitTask:
     setting: Setting
     source: Source
     last: Record | None = None  # the previous frame, in a sequence
-    folder: str = ALONE  # subfolder that the fit is written to
+    folder: str = SINGLE_FITS  # subfolder that the fit is written to
     other_side: bool = False
     whole: float | None = None
 
@@ -69,11 +69,11 @@ def fit_alone(task: FitTask) -> Record:
         assert fit.repaired is not None
         reasons, other, samples = "; ".join(fit.reasons), "", None
         if fit.verdict == "poor" and setting.model != NO_MODEL:
-            other = other_kind(setting.trained, fit.repaired.shape, setting.config) or ""
+            other = differing_kind(setting.trained, fit.repaired.shape, setting.config) or ""
             reasons = f"it is of another kind: {other}; {reasons}" if other else reasons
         if setting.agrees:
             how = AgreeConfig.for_collection(setting.trained)
-            samples = member_of(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
+            samples = make_member(node_system(setting.trained), fit.repaired.shape, fit, setting.config, how).samples
         likely, uncertain = fit.trust, setting.model == NO_MODEL or (fit.verdict == "poor" and not setting.learned)
         if fit.signs is not None and not uncertain:
             likely = fit.signs.p_correct(calibration_of(setting.trained.card.category))
@@ -82,7 +82,7 @@ def fit_alone(task: FitTask) -> Record:
         if setting.model == NO_MODEL:
             notes += fit.notes
         elif fit.frame.mirrored:
-            notes.append(side_words(setting.trained.card))
+            notes.append(mirror_note(setting.trained.card))
         record = Record(
             name=source.name,
             file=source.path,
@@ -120,7 +120,7 @@ def _read_matching_record(store: Store, file: str, digests: Sequence[str]) -> Re
         return None
     try:
         with store.reading(file) as path:
-            record = Record.of(load_words(path)[1]["record"])
+            record = Record.of(read_fit_header(path)[1]["record"])
     except (InputError, KeyError, TypeError):
         return None
     return record if record.digest in digests else None
@@ -173,7 +173,7 @@ def agree_group(task: AgreeTask) -> Float[Floats, "G 3 3"]:
     """
     setting, group, store = task.setting, task.group, task.setting.store
     system, how = node_system(setting.trained), AgreeConfig.for_collection(setting.trained)
-    members = [_build_member(setting.read(ALONE, name), how) for name in group.names]
+    members = [_build_member(setting.read(SINGLE_FITS, name), how) for name in group.names]
 
     def after(step: int) -> Floats:
         return load_array(store, group.file(step)) if step > 0 else np.array([member.vectors for member in members])
@@ -235,7 +235,7 @@ def is_finished(store: Store, task: FinishTask) -> bool:
     if not store.exists(task.file):
         return False
     with store.reading(task.file) as path, suppress(InputError):
-        words = load_words(path)[1]
+        words = read_fit_header(path)[1]
         return (words.get("digest"), words.get("agreed_with")) == (task.digest, task.agreed_with)
     return False
 
@@ -257,7 +257,7 @@ def finish(task: FinishTask) -> Finished:
         if not is_finished(task.setting.store, task):
             _write_finished_fit(task)
         with task.setting.store.reading(task.file) as path:
-            about = load_words(path)[0]
+            about = read_fit_header(path)[0]
             reasons = tuple(str(sentence) for _, sentence in about["reasons"])
             return Finished("", about["verdict"], reasons, about["trust"], regularity_of(about))
     except MeshmatchError as error:
@@ -267,13 +267,13 @@ def finish(task: FinishTask) -> Finished:
 def _write_finished_fit(task: FinishTask) -> None:
     """Judge a fit by comparison, apply the result of the agreement, and store it with the places of its vertices."""
     setting, name = task.setting, task.source.name
-    alone = setting.read(ALONE, name)
-    part = validated(leave_out(task.source.load(setting.only, setting.without), alone.fit.left_out))
+    alone = setting.read(SINGLE_FITS, name)
+    part = repair_or_raise(leave_out(task.source.load(setting.only, setting.without), alone.fit.left_out))
     before = replace(alone.fit, repaired=part, verts=part.shape.verts)
     if task.usual is not None:
         before = task.usual.judged(before, Record.of(alone.words["record"]))
     fit = before
-    group = None if not setting.learned and setting.agrees and is_finer(setting.trained, before) else task.group
+    group = None if not setting.learned and setting.agrees and is_refined(setting.trained, before) else task.group
     if group is not None:
         vectors = load_array(setting.store, group.file(task.step))[group.names.index(name)]
         system = node_system(setting.trained)

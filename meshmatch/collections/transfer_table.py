@@ -16,9 +16,9 @@ import numpy as np
 from meshmatch import __version__
 from meshmatch.api.matcher import Matcher
 from meshmatch.collections.collection import Collection
-from meshmatch.collections.endings import Ending
 from meshmatch.collections.setting import FAILED
 from meshmatch.collections.stores import Store
+from meshmatch.collections.suffixes import Ending
 from meshmatch.errors import MeshmatchError, OptionError, OutputError
 from meshmatch.outputs import make_folder, replace_on_success
 from meshmatch.shapes.shape import Shape

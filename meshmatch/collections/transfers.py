@@ -11,13 +11,13 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from meshmatch.api.measure import is_body, meant_source
+from meshmatch.api.measure import is_body, resolve_source
 from meshmatch.api.results import MapPair
 from meshmatch.collections.collection import Collection
-from meshmatch.collections.endings import ending_of
 from meshmatch.collections.setting import FAILED, LEFT_OUT
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
+from meshmatch.collections.suffixes import choose_suffix
 from meshmatch.collections.transfer_table import TransferRecord, transfer_each, with_hint
 from meshmatch.errors import InputError, MeshmatchError, warn
 from meshmatch.outputs import as_path
@@ -60,7 +60,7 @@ class Targets:
 
         The source, the input ``other`` and files in the ``output`` folder are excluded. `InputError` if none is left.
         """
-        fits, has_source, meant = Path(given[0], _FITS), False, meant_source(source)
+        fits, has_source, meant = Path(given[0], _FITS), False, resolve_source(source)
         if len(given) == 1 and fits.is_file():
             with fits.open(encoding="utf-8", newline="") as file:
                 rows = [row for row in csv.DictReader(file) if row.get("verdict") not in (FAILED, LEFT_OUT)]
@@ -196,7 +196,7 @@ class Transfers(Generic[R]):
         found = self._find_targets(folder)
         garment = self.choices.get("garment")
         worn = Path(garment) if isinstance(garment, str | Path) else None
-        ending = ending_of(word, suffix, worn, found.files)
+        ending = choose_suffix(word, suffix, worn, found.files)
 
         def transfer_one(name: str, file: Path, output: Path) -> tuple[str, float | None]:
             result = self._transfer_to(file, found)

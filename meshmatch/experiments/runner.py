@@ -97,9 +97,9 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
             out.print(each)
         for line in report.notes:
             out.print(line, soft_wrap=True, markup=False)
-        metadata = {"experiment": name, **circumstances(threads, jobs), "options": plain(options)}
+        metadata = {"experiment": name, **run_metadata(threads, jobs), "options": to_json(options)}
         metadata["seconds"] = round(time.perf_counter() - start, 1)
-        print(json.dumps(plain({**metadata, **report.record})), flush=True)
+        print(json.dumps(to_json({**metadata, **report.record})), flush=True)
         if save is not None:
             record = saved_record(metadata, [f"{program} {shlex.join(words)}".strip()], report)
             with replace_on_success(save) as temporary:
@@ -146,7 +146,7 @@ def saved_record(metadata: Mapping[str, Any], commands: Sequence[str], report: R
     data = metadata["options"].get("data", "generated")
     tables = [{"title": str(each.title), **dict(zip(("columns", "rows"), table_cells(each), strict=True))}
               for each in report.tables]  # fmt: skip
-    return {**metadata, "commands": list(commands), "data": data, "tables": tables, "values": plain(report.record)}
+    return {**metadata, "commands": list(commands), "data": data, "tables": tables, "values": to_json(report.record)}
 
 
 def explain(error: MeshmatchError) -> None:
@@ -157,7 +157,7 @@ def explain(error: MeshmatchError) -> None:
         console.print(f"[dim]hint:[/] {escape(error.hint)}", soft_wrap=True)
 
 
-def tell(line: str) -> None:
+def log(line: str) -> None:
     """Print a line about the progress on stderr."""
     Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)
 
@@ -168,12 +168,12 @@ def track(items: Iterable[T], what: str, total: int | None = None) -> Iterable[T
     return progress.track(items, what, total=total, console=console, disable=not console.is_terminal)
 
 
-def plain(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """Convert a value for JSON: tuples and arrays to lists, numbers that are not finite to null, paths to strings."""
     if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
+        return {str(key): to_json(each) for key, each in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [plain(each) for each in value]
+        return [to_json(each) for each in value]
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     if isinstance(value, np.integer):
@@ -187,7 +187,7 @@ def installed(methods: Sequence[str], packages: Sequence[str]) -> tuple[list[str
     return [name for name in methods if name not in missing], [f"skipped: {name} is not installed" for name in missing]
 
 
-def names_of(words: str, known: Iterable[str], what: str) -> list[str]:
+def split_names(words: str, known: Iterable[str], what: str) -> list[str]:
     """Split names separated by commas, without duplicates; ``what`` they are, for messages.
 
     Raises
@@ -214,7 +214,7 @@ def files_in(folder: Path, pattern: str, least: int = 1) -> list[Path]:
     return files
 
 
-def spread(items: Sequence[T], count: int | None) -> list[T]:
+def evenly_spread(items: Sequence[T], count: int | None) -> list[T]:
     """Select ``count`` items at even distances in a sequence; all items if ``count`` is None or not smaller."""
     if count is None or count >= len(items):
         return list(items)
@@ -251,7 +251,7 @@ def table_cells(table: Table) -> tuple[list[str], list[list[str]]]:
     return [str(column.header) for column in table.columns], [list(row) for row in rows]
 
 
-def circumstances(threads: int, jobs: int = 1) -> dict[str, Any]:
+def run_metadata(threads: int, jobs: int = 1) -> dict[str, Any]:
     """Metadata of a run, as published with every number: date, commit, machine, Python, threads and jobs."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -319,7 +319,7 @@ def check_cached(record: Any, asked: Mapping[str, Any], where: str) -> dict[str,
         stored = dict(record["asked"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{where} is not a result of this experiment", "remove it to measure again") from error
-    requested = plain(asked)
+    requested = to_json(asked)
     if differences := sorted(key for key in {*stored, *requested} if stored.get(key) != requested.get(key)):
         raise OptionError(
             f"{where} was measured with other options ({', '.join(differences)})",
@@ -330,21 +330,21 @@ def check_cached(record: Any, asked: Mapping[str, Any], where: str) -> dict[str,
 
 def write_cached(path: Path, asked: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
     """Write a result to the cache together with its options, and return the record."""
-    record: dict[str, Any] = plain({"asked": asked, **result})
+    record: dict[str, Any] = to_json({"asked": asked, **result})
     make_folder(path.parent)
     with replace_on_success(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     return record
 
 
-def once(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+def cached(path: Path, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
     """Return a cached result, or measure and cache it; an interrupted run thus continues with what is missing."""
     result = read_cached(path, asked)
     return write_cached(path, asked, measure()) if result is None else result
 
 
-def at_work(
+def cached_in(
     work: Path | None, name: str, asked: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """As `once`, in a file of the folder ``work``; without a folder always measure."""
-    return plain(measure()) if work is None else once(work / f"{name}.json", asked, measure)
+    """As `cached`, in a file of the folder ``work``; without a folder always measure."""
+    return to_json(measure()) if work is None else cached(work / f"{name}.json", asked, measure)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints, as_numbers, is_tensor
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr, as_numbers, is_tensor
 from meshmatch.errors import InputError
 from meshmatch.fields.local_fits import namespace
 from meshmatch.fields.shape_functions import ShapeFunctions
@@ -224,7 +224,7 @@ def rotated_rows(rows: Float[Floats, "R 3"], turn: Float[Floats, "3 3"]) -> Floa
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PointwiseField(Brief):
+class PointwiseField(ShortRepr):
     """A network's motion on fixed points, with deformation gradients at ``gradient_points``; codes have length D."""
 
     points: Float[torch.Tensor, "P 3"]

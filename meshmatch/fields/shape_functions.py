@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints, as_numbers
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr, as_numbers
 from meshmatch.errors import InputError, OptionError, TemplateError, warn
 from meshmatch.fields.local_fits import LocalFits
 from meshmatch.geometry.kernels import KERNELS, Kernel
@@ -53,7 +53,7 @@ def has_nodes(name: FieldName) -> bool:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ShapeFunctions(Brief):
+class ShapeFunctions(ShortRepr):
     """Shape functions of K nodes on P fixed points.
 
     ``phi`` (P, K) and ``gradient`` (3 P, K), which is computed on first use, are float32, sparse (CSR) or dense. With

@@ -47,7 +47,7 @@ def agreed_fits(
 
     def member(number: int) -> Member:
         known = None if landmarks is None else landmarks[number]
-        return member_of(system, shapes[number], fits[number], config, how, known)
+        return make_member(system, shapes[number], fits[number], config, how, known)
 
     if model.pairs is not None and model.pairs.components.shape[1] != 6 * len(system.gradient_points):
         raise ModelError(
@@ -58,7 +58,7 @@ def agreed_fits(
     return [with_vectors(system, fit, vectors) for fit, vectors in zip(fits, refined, strict=True)]
 
 
-def member_of(
+def make_member(
     system: NodeSystem, shape: Shape, fit: Fit, config: FitConfig, how: AgreeConfig, landmarks: Landmarks | None = None
 ) -> Member:
     """Prepare a repaired shape and its fit for agreement; landmarks are in the shape's file frame."""

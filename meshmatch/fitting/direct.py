@@ -45,9 +45,9 @@ from meshmatch.geometry.oriented import with_normals
 from meshmatch.geometry.triangles import vertex_normals
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.progress import Progress, ProgressCallback
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import apart, mirrored
+from meshmatch.templates.mirror_images import alignment_residuals, mirrored
 from meshmatch.threads import parallel_calls, parallel_map
 
 # Two maps, for example a map and the guess, are the same if no more than this share of vertices differs.
@@ -61,7 +61,7 @@ _MIRROR_LEAD, _MIRROR_LEAD_IF_UNLIKE, _MIN_RELIEF, _MIRROR_ENERGY_RATIO = 0.15, 
 # the difference of relief falls below the second number as a share: 0.24 to 0.92 for hands, mostly below 0.6; 0.5 to 1 for
 # animals, mostly above 0.75.
 _MAX_RIGID_DISTANCE, _MIRROR_RELIEF_RATIO = 0.07, 0.6
-CLEARLY = 0.003
+MIN_ENERGY_LEAD = 0.003
 """How much lower the energy of a doubtful map must be for it to replace what a model found."""
 MIRROR = Frame(1.0, np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
 _NORMAL_WEIGHT = 0.1  # weight of unit normals against positions when vertices are transferred between deformed shapes
@@ -109,7 +109,7 @@ class DirectMatch:
     tried: tuple[tuple[str, float], ...]
     system: NodeSystem
     leads: tuple[float, ...] = ()
-    over_guess: float = np.inf
+    guess_lead: float = np.inf
     earlier: Callable[[], DirectMatch] | None = None
     turns: int = 1
     apart: tuple[float, float] | None = None
@@ -203,7 +203,7 @@ def match_either_side(
     return replace(_unmirrored(image.matched(to_image, report, began), target), apart=search.apart)
 
 
-def match_where_it_lies(
+def match_to_best_of(
     source: Shape,
     targets: Sequence[Shape],
     config: DirectConfig | None = None,
@@ -316,7 +316,7 @@ class _Search:
     @cached_property
     def apart(self) -> tuple[float, float]:
         """Distances that rigid motions leave between the shapes, and between the source and the target's mirror image."""
-        return apart(self.source.original, self.target.original, self.source.config.seed)
+        return alignment_residuals(self.source.original, self.target.original, self.source.config.seed)
 
     def one_way(self, report: Progress, meanwhile: Sequence[Callable[[], object]] = ()) -> list[ShapeFit]:
         """The best fits of the source to the target, best first; see `fit_one_way`."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshmatch.arrays import Float, Floats, Int, Ints, Pickled, table_html
+from meshmatch.arrays import Float, Floats, Int, Ints, PickledFields, table_html
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.judge.reasons import Reason, Verdict
 from meshmatch.fitting.solve.regularity import Regularity
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit(Pickled):
+class Fit(PickledFields):
     """A template fitted to one shape.
 
     Attributes

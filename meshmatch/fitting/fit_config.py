@@ -14,7 +14,7 @@ from meshmatch.models.card import MIRRORINGS
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
-    from meshmatch.shapes.normalise import Mirroring
+    from meshmatch.shapes.alignment import Mirroring
 
 Refine = Literal["none", "latent", "nodes"]
 """How a fit is refined, see `meshmatch.fitting.search.refinement.REFINEMENTS`."""

@@ -9,26 +9,26 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, off_torch
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, to_numpy
 from meshmatch.errors import OptionError
 from meshmatch.fitting.fit import Fit, judged_fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.features import uncovered_share
 from meshmatch.fitting.judge.reasons import SIDE_IN_DOUBT, Reason, Verdict
 from meshmatch.fitting.judge.verdict import LIMITS, judge_registration
+from meshmatch.fitting.reference_statistics import Usual
 from meshmatch.fitting.search.predictor import mirror_of
 from meshmatch.fitting.search.refinement import REFINEMENTS, fit_part, fit_whole
 from meshmatch.fitting.search.task import FitTask, Registration
 from meshmatch.fitting.search.thick_parts import with_thick_part_smaller
 from meshmatch.fitting.search.untangling import untangled
 from meshmatch.fitting.solve.terms import Landmarks
-from meshmatch.fitting.usual import Usual
 from meshmatch.geometry.oriented import quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.card import ModelCard
 from meshmatch.models.trained import TrainedModel, torch_network
 from meshmatch.progress import Progress, ProgressCallback
-from meshmatch.shapes.normalise import ALIGNS
+from meshmatch.shapes.alignment import ALIGNS
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
@@ -91,7 +91,7 @@ class Fitter:
         light_config = replace(config, finalists=1) if declared_part else config
         wholes = [whole(light_config, mirrored) for mirrored in ((False, True) if both_sides else (False,))]
         # If either handedness fits the whole shape, the other is not tried as a part.
-        try_parts = landmarks is None and _may_be_part(min(wholes, key=_cost))
+        try_parts = landmarks is None and _part_is_plausible(min(wholes, key=_cost))
         sides = [_as_part_if_better(each) if try_parts else (each, False) for each in wholes]
         (found, partial), *others = sorted(sides, key=lambda side: _cost(side[0]))
         if declared_part and not partial:
@@ -117,14 +117,14 @@ def _has_specific_reason(fit: Fit) -> bool:
     return any(reason.code != "doubt" for reason in fit.reasons)
 
 
-def side_words(card: ModelCard) -> str:
+def mirror_note(card: ModelCard) -> str:
     """Return the note for a shape that was fitted as a mirror image."""
     return f"taken for the mirror image of what {card.name} knows"
 
 
 def with_mirror_note(notes: Sequence[str], name: str, card: ModelCard, mirrored: bool) -> tuple[str, ...]:
     """Return notes in which the note on the mirror image is present if and only if the shape was fitted as one."""
-    of_mirror_image = f"{name}: {side_words(card)}"
+    of_mirror_image = f"{name}: {mirror_note(card)}"
     return (*([of_mirror_image] if mirrored else []), *(note for note in notes if note != of_mirror_image))
 
 
@@ -147,7 +147,7 @@ def _cost(found: Registration) -> float:
 
 def _as_part_if_better(whole: Registration) -> tuple[Registration, bool]:
     """Return the fit of the whole, or a fit as a part if that is plausible and better; and whether it is a part."""
-    if not _may_be_part(whole):
+    if not _part_is_plausible(whole):
         return whole, False
     config = whole.task.config
     thorough = config.try_harder or config.partial == "yes" or _leaves_template_uncovered(whole)
@@ -178,7 +178,7 @@ def cap_verdict(fit: Fit, doubts: Sequence[Reason]) -> Fit:
     )
 
 
-def _may_be_part(whole: Registration) -> bool:
+def _part_is_plausible(whole: Registration) -> bool:
     """Return whether fitting the shape as a part is worth the time.
 
     It is if the user declares a part and the fit of the whole is not good; or, where the shape could be a part at all, if an
@@ -191,7 +191,7 @@ def _may_be_part(whole: Registration) -> bool:
         return True
     if declared == "auto" and not REFINEMENTS[task.config.refine].tries_parts:
         return False
-    if not may_show_part(task.shape, task.config):
+    if not may_be_part(task.shape, task.config):
         return False
     # The residual of a cloud reflects its density and noise instead.
     if not task.shape.is_cloud and whole.candidate.residual > LIMITS.search_parts:
@@ -206,7 +206,7 @@ def _leaves_template_uncovered(whole: Registration) -> bool:
     return uncovered_share(whole.local, whole.surface.points) > _PART_UNCOVERED
 
 
-def may_show_part(shape: Shape, config: FitConfig) -> bool:
+def may_be_part(shape: Shape, config: FitConfig) -> bool:
     """Return whether a shape could be a part: by configuration, as a cloud, or as a mesh with a long boundary."""
     if config.partial != "auto":
         return config.partial == "yes"
@@ -303,7 +303,7 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
         raise OptionError(f"landmarks must be two lists of vertices, not {len(landmarks)}", _HINT)
     places = []
     for part, vertices in zip(clean, landmarks, strict=True):
-        numbers, V = np.asarray(off_torch(vertices)), len(part.original_to_repaired)
+        numbers, V = np.asarray(to_numpy(vertices)), len(part.original_to_repaired)
         if numbers.ndim != 1 or len(numbers) == 0 or numbers.dtype.kind not in "iu" or numbers.min() < 0:
             raise OptionError("landmarks must be lists of vertex numbers", _HINT)
         if numbers.max() >= V:
@@ -326,7 +326,7 @@ def landmark_places(clean: Sequence[Repaired], landmarks: Sequence[ArrayLike]) -
     return places
 
 
-def fits_with_landmarks(
+def refit_with_landmarks(
     model: TrainedModel,
     clean: Sequence[Repaired],
     fits: Sequence[Fit],

@@ -36,7 +36,7 @@ def with_more_nodes(template: Template, config: ViscousConfig) -> Template:
     return make_template(shape, template.name, nodes, low=(np.arange(shape.V), np.asarray(shape.faces)))
 
 
-def finest(template: Template, config: ViscousConfig) -> Template:
+def with_final_nodes(template: Template, config: ViscousConfig) -> Template:
     """The same template vertices with more nodes, for the final fits of shapes in the same pose.
 
     Sheets such as leaves keep their nodes: they slide along themselves, and more nodes made them worse (0.67 to 1.86 mm).

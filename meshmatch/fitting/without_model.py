@@ -26,7 +26,7 @@ from meshmatch.fitting.judge.direct import DirectFeatures
 from meshmatch.fitting.judge.features import compute_features
 from meshmatch.fitting.judge.reasons import Reason
 from meshmatch.fitting.judge.verdict import Judgement, judge
-from meshmatch.fitting.kind_templates import finest, viscous_system
+from meshmatch.fitting.kind_templates import viscous_system, with_final_nodes
 from meshmatch.fitting.one_way import DirectConfig
 from meshmatch.fitting.search.predictor import part_residual
 from meshmatch.fitting.search.task import take_samples
@@ -37,11 +37,11 @@ from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import NO_MODEL
-from meshmatch.shapes.normalise import Align, align, sqrt_area_frame
+from meshmatch.shapes.alignment import Align, align, sqrt_area_frame
 from meshmatch.shapes.rims import RimPoints, is_sheet
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import mirrored
+from meshmatch.templates.mirror_images import mirrored
 from meshmatch.templates.template import Template
 from meshmatch.threads import parallel_calls, parallel_map
 
@@ -84,7 +84,7 @@ _STRETCH_WEIGHT = 0.03  # weight of the stretch in an energy, relative to the re
 _FOLDING_STRETCH = 1.0
 
 
-def stand_alike(residual: float, stretch: float) -> bool:
+def has_template_pose(residual: float, stretch: float) -> bool:
     """Return whether a shape has the template's pose, given the residual and stretch of its fit."""
     return residual < _MAX_ALIKE_RESIDUAL and stretch < _MAX_ALIKE_STRETCH
 
@@ -116,7 +116,7 @@ class _Fitted:
     @property
     def alike(self) -> bool:
         """Whether the shape has the template's pose."""
-        return stand_alike(self.features.residual, self.features.stretch)
+        return has_template_pose(self.features.residual, self.features.stretch)
 
 
 class _Task:
@@ -278,7 +278,7 @@ def fit_without_model(
     return (_Judged.of(part_task, part) if part.energy < clearly * found.energy else as_whole).fit(log_ratio, began)
 
 
-def fit_near(
+def fit_same_pose_near(
     template: Template,
     shape: Shape,
     start: Fit,
@@ -314,12 +314,12 @@ def fit_near(
         certain = sided and best.alike and other.alike
         if log_ratio < 0 if certain else _clearly_better(other, best, _TURNED_RATIO) is other:
             best, log_ratio = other, -log_ratio
-    task = _Task(finest(template, config) if best.alike else template, shape, config)
+    task = _Task(with_final_nodes(template, config) if best.alike else template, shape, config)
     found = task.fitted(replace(best.initial, vectors=np.zeros((task.system.K, 3))))
     return _Judged.of(task, found).fit(log_ratio, began) if found.alike else None
 
 
-def fit_otherwise(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> tuple[Fit, bool]:
+def fit_other_pose(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> tuple[Fit, bool]:
     """Fit a template to a repaired shape that has another pose.
 
     Parameters
@@ -346,7 +346,7 @@ def fit_otherwise(template: Template, shape: Shape, start: Fit, config: ViscousC
     return _Judged.of(task, task.fitted(best.initial)).fit(0.0, began), best is moved
 
 
-def fit_alike(
+def fit_same_pose(
     template: Template,
     shape: Shape,
     search_result: tuple[Float[Floats, "N 3"], Fit],
@@ -405,7 +405,7 @@ def fit_alike(
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class RigidAlignment:
     """A shape relative to a rigidly aligned template.
 
     ``frame`` goes from the shape's file to the template, ``stretch`` is the template's, and ``alike`` says whether the
@@ -417,10 +417,10 @@ class Standing:
     alike: bool
 
 
-def standing(template: Template, shape: Shape, seed: int) -> Standing:
+def align_by_fits(template: Template, shape: Shape, seed: int) -> RigidAlignment:
     """Align a template to a repaired shape by fits from the best few rotations."""
     best = _Task(template, shape, _quick(seed)).best_turn(None)
-    return Standing(best.initial.frame, max(best.features.stretch, _MIN_STRETCH), best.alike)
+    return RigidAlignment(best.initial.frame, max(best.features.stretch, _MIN_STRETCH), best.alike)
 
 
 def fit_from(template: Template, shape: Shape, start: Fit, config: ViscousConfig) -> Fit | None:
@@ -430,7 +430,7 @@ def fit_from(template: Template, shape: Shape, start: Fit, config: ViscousConfig
     return _Judged.of(task, found).fit(0.0, began) if found.alike else None
 
 
-def fit_turned(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
+def fit_rotated(template: Template, shape: Shape, turn: Float[Floats, "3 3"], config: ViscousConfig) -> Fit:
     """Fit a template to a repaired shape in the same pose, given the rotation from the shape's file to the template."""
     began, task = time.monotonic(), _Task(template, shape, config)
     initial = task.start_near(replace(sqrt_area_frame(shape), rotation=turn))

@@ -18,7 +18,7 @@ from meshmatch.generators.bodies import (
     pose_limbs,
     sample_free_pose,
 )
-from meshmatch.generators.clothes import dressed, skirted
+from meshmatch.generators.clothes import add_clothes, add_skirts
 from meshmatch.generators.figure import Figure
 from meshmatch.generators.generator import Source, mix_sources
 from meshmatch.generators.limbs import Draw, Limbs
@@ -29,9 +29,9 @@ from meshmatch.generators.proportions import (
     STYLISED,
     TOON,
     draw_style,
-    rounded,
+    round_parts,
+    scale_bones,
     shares_with_stylised,
-    stretched,
 )
 from meshmatch.generators.rig import Rig, forward_kinematics, skin
 from meshmatch.generators.scanned_bodies import scanned_source
@@ -90,16 +90,16 @@ def _sample(
     is_clothed = (torch.rand(B, generator=generator)[characters] < _CLOTHED_SHARE) | (style.kind == PLAIN)
     naked = rest
     if len(characters):
-        shaped_rest, shaped_heads = stretched(figure, rest[characters], heads[characters], style)
+        shaped_rest, shaped_heads = scale_bones(figure, rest[characters], heads[characters], style)
         to_round = torch.nonzero(style.kind >= TOON)[:, 0]
         if len(to_round):
-            shaped_rest[to_round] = rounded(
+            shaped_rest[to_round] = round_parts(
                 figure, shaped_rest[to_round], shaped_heads[to_round], style.kind[to_round], generator
             )
         if with_naked:
             naked = rest.index_copy(0, characters, shaped_rest)
         if is_clothed.any():
-            shaped_rest[is_clothed] = dressed(figure, shaped_rest[is_clothed], shaped_heads[is_clothed], generator)
+            shaped_rest[is_clothed] = add_clothes(figure, shaped_rest[is_clothed], shaped_heads[is_clothed], generator)
         rest[characters], heads[characters] = shaped_rest, shaped_heads
     world, offset = sample_free_pose(rig, heads, generator)
     if config.poses is not None:
@@ -116,7 +116,7 @@ def _sample(
     skirts = characters[is_clothed & (torch.rand(len(characters), generator=generator) < _SKIRT_SHARE)]
     if len(skirts):
         joints = (world[skirts] @ heads[skirts][..., None])[..., 0] + offset[skirts]
-        verts[skirts] = skirted(figure, verts[skirts], heads[skirts], joints, generator)
+        verts[skirts] = add_skirts(figure, verts[skirts], heads[skirts], joints, generator)
     smoothed = characters[is_clothed & (torch.rand(len(characters), generator=generator) < 0.5)]
     if len(smoothed):
         verts[smoothed] = figure.smooth(verts[smoothed], 6)

@@ -44,7 +44,7 @@ def step(values: Tensor, at: Tensor, width: float = _HEM) -> Tensor:
     return t * t * (3 - 2 * t)
 
 
-def dressed(
+def add_clothes(
     figure: Figure, rest: Float[Tensor, "B V 3"], heads: Float[Tensor, "B J 3"], generator: torch.Generator,
 ) -> Float[Tensor, "B V 3"]:  # fmt: skip
     """Add clothes to bodies at rest: trousers, tops, shoes, gloves, hoods or hair, belts and bags."""
@@ -162,7 +162,7 @@ def _headwear(figure: Figure, verts: Tensor, draw: ClothingDraw) -> Tensor:
     return verts + brim[..., None] * horizontal
 
 
-def skirted(
+def add_skirts(
     figure: Figure, verts: Float[Tensor, "B V 3"], heads: Float[Tensor, "B J 3"], joints: Float[Tensor, "B J 3"],
     generator: torch.Generator,
 ) -> Float[Tensor, "B V 3"]:  # fmt: skip

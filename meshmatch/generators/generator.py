@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
-from meshmatch.shapes.normalise import Mirroring
+from meshmatch.shapes.alignment import Mirroring
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.make import NodeConfig, make_template

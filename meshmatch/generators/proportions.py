@@ -84,7 +84,7 @@ def _part_indices(name: str) -> tuple[int, ...]:
     return (part(name, "L"), part(name, "R")) if name in SIDED else (part(name),)
 
 
-def stretched(
+def scale_bones(
     figure: Figure, rest: Float[Tensor, "B V 3"], heads: Float[Tensor, "B J 3"], style: Style
 ) -> tuple[Float[Tensor, "B V 3"], Float[Tensor, "B J 3"]]:
     """Scale the bones of bodies at rest; return vertices and joints."""
@@ -100,7 +100,7 @@ def stretched(
     return skin(figure.rig, rest, scale, new_heads - (scale @ heads[..., None])[..., 0]), new_heads
 
 
-def rounded(
+def round_parts(
     figure: Figure, rest: Float[Tensor, "B V 3"], heads: Float[Tensor, "B J 3"], kind: Int[Tensor, " B"],
     generator: torch.Generator,
 ) -> Float[Tensor, "B V 3"]:  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.frames import RigidPose
-from meshmatch.geometry.oriented import OrientedPoints, nearest, with_normals
+from meshmatch.geometry.oriented import OrientedPoints, nearest_by_brute_force, with_normals
 
 # Set by hand, in units of sqrt(area): scale of the robust weights, and the distance at which residuals are capped.
 _ROBUST_SCALE, _MAX_DISTANCE = 0.1, 0.2
@@ -53,8 +53,10 @@ class ClosestPoints:
         self, shape_local: Float[Floats, "N P 6"], target_world: Float[Floats, "N Q 6"]
     ) -> tuple[Int[Ints, "N P"], Int[Ints, "N Q"]]:
         """Indices of the target points closest to the shape's queries, and of the shape points closest to the target's."""
-        to_target = nearest(self._features[1], shape_local.reshape(-1, 6)).reshape(shape_local.shape[:2])
-        return to_target, nearest(self._features[0], target_world.reshape(-1, 6)).reshape(target_world.shape[:2])
+        to_target = nearest_by_brute_force(self._features[1], shape_local.reshape(-1, 6)).reshape(shape_local.shape[:2])
+        return to_target, nearest_by_brute_force(self._features[0], target_world.reshape(-1, 6)).reshape(
+            target_world.shape[:2]
+        )
 
     def residuals(self, poses: list[RigidPose]) -> Float[Floats, " N"]:
         """Mean capped distance both ways for each pose, normals included."""

@@ -13,15 +13,15 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.smoothing import factors
+from meshmatch.geometry.smoothing import factorize
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import (
+    areas_to_vertices,
+    component_minima,
     dot,
     edge_keys,
     edges_of,
-    share_areas,
     squared_lengths,
-    together,
     triangle_areas,
 )
 
@@ -85,7 +85,7 @@ class Disk:
         areas = triangle_areas(own, self.corners)
         if not areas.sum() > 0:
             return None
-        around = np.maximum(share_areas(areas, self.corners, len(own)), 1e-300)
+        around = np.maximum(areas_to_vertices(areas, self.corners, len(own)), 1e-300)
         rim = _circle(own[self.rim], float(areas.sum())) if rim is None else rim
         best, best_energy, scales = None, np.inf, np.ones(len(own))
         springs = _Springs(mean_values(own, self.corners), self.rim)
@@ -101,7 +101,7 @@ class Disk:
             if not energy < best_energy:
                 break
             best, best_energy = places, energy
-            mean = share_areas(areas * squared, self.corners, len(own)) / around
+            mean = areas_to_vertices(areas * squared, self.corners, len(own)) / around
             scales = scales / np.clip(np.sqrt(np.maximum(mean, 0.0)), *_STRETCH_BOUNDS)
         return best
 
@@ -148,11 +148,13 @@ class _Springs:
             result[self.free] = np.linalg.solve(matrix, right)
         else:
             sparse = csc_array((entries, (rows, columns)), shape=(N, N))
-            result[self.free] = factors(sparse).solve(right)
+            result[self.free] = factorize(sparse).solve(right)
         return result
 
 
-def patches(surface: Int[Ints, "F 3"], inside: Bool[Bools, " F"], zone: Bool[Bools, " F"]) -> list[Int[Ints, " N"]]:
+def edge_connected_patches(
+    surface: Int[Ints, "F 3"], inside: Bool[Bools, " F"], zone: Bool[Bools, " F"]
+) -> list[Int[Ints, " N"]]:
     """Edge-connected groups of the faces ``inside``, each with the faces of ``zone`` that it encloses."""
     rest = np.flatnonzero(zone & ~inside)
     if len(rest):
@@ -168,7 +170,7 @@ def patches(surface: Int[Ints, "F 3"], inside: Bool[Bools, " F"], zone: Bool[Boo
     return np.split(rows[order], np.flatnonzero(np.diff(component[order])) + 1) if len(rows) else []
 
 
-def found_in(
+def locate_points(
     places: Float[Floats, "M 2"], corners: Int[Ints, "F 3"], points: Float[Floats, "N 2"]
 ) -> tuple[Int[Ints, " N"], Float[Floats, "N 3"], Bool[Bools, " N"]]:
     """Locate points in triangles of the plane.
@@ -217,7 +219,7 @@ def _edge_components(faces: Int[Ints, "F 3"]) -> Int[Ints, " F"]:
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(np.diff(keys[order]) == 0)
     face = order % max(len(faces), 1)
-    return together(len(faces), face[same], face[same + 1])
+    return component_minima(len(faces), face[same], face[same + 1])
 
 
 def _circle(points: Float[Floats, "R 3"], area: float) -> Float[Floats, "R 2"]:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Brief, Float, Floats, Pickled, as_numbers, as_read_only, off_torch
+from meshmatch.arrays import Float, Floats, PickledFields, ShortRepr, as_numbers, as_read_only, to_numpy
 from meshmatch.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Frame(Brief, Pickled):
+class Frame(ShortRepr, PickledFields):
     """A similarity between a file's coordinates and a model's.
 
     It contains a reflection for a shape that is fitted in mirror image.
@@ -87,7 +87,7 @@ class Frame(Brief, Pickled):
         (..., 3) float64
             In the model's frame.
         """
-        return ((np.asarray(off_torch(points), np.float64) - self.center) @ self.rotation.T) / self.scale
+        return ((np.asarray(to_numpy(points), np.float64) - self.center) @ self.rotation.T) / self.scale
 
     def undo(self, points: ArrayLike) -> Float[Floats, "... 3"]:
         """Transform points from the model back to the file.
@@ -102,7 +102,7 @@ class Frame(Brief, Pickled):
         (..., 3) float64
             In the file's coordinates.
         """
-        return (np.asarray(off_torch(points), np.float64) * self.scale) @ self.rotation + self.center
+        return (np.asarray(to_numpy(points), np.float64) * self.scale) @ self.rotation + self.center
 
     def compose(self, outer: Frame) -> Frame:
         """Apply this frame first, then `outer`: ``self.compose(outer).apply(x) = outer.apply(self.apply(x))``.

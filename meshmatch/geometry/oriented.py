@@ -47,7 +47,7 @@ class OrientedPoints:
     def _trees(self) -> dict[float, cKDTree]:
         return {}
 
-    def pair_tree(self, weight: float) -> cKDTree:
+    def weighted_tree(self, weight: float) -> cKDTree:
         """A k-d tree over the features with another ``weight`` of normals; built once for each weight."""
         if weight not in self._trees:
             self._trees[weight] = feature_tree(with_normals(self.points, self.normals, weight))
@@ -137,7 +137,9 @@ def quick_tree(points: Float[Floats | Floats32, "P D"]) -> cKDTree:
     return cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
 
-def nearest(points: Float[Floats | Floats32, "P D"], queries: Float[Floats | Floats32, "Q D"]) -> Int[Ints, " Q"]:
+def nearest_by_brute_force(
+    points: Float[Floats | Floats32, "P D"], queries: Float[Floats | Floats32, "Q D"]
+) -> Int[Ints, " Q"]:
     """Index of the point nearest to each query, by comparing all pairs in float32; for a few thousand points at most.
 
     Faster than a k-d tree, which is slow for queries far from the points. Among points whose squared distances differ

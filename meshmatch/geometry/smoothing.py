@@ -26,7 +26,7 @@ def laplacian(edges: Int[Ints, "E 2"], weight: Float[Floats, " E"], V: int) -> c
     return csr_array(diags_array(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours)
 
 
-def factors(matrix: csc_array) -> SuperLU:
+def factorize(matrix: csc_array) -> SuperLU:
     """Sparse LU factorization without pivoting.
 
     For matrices that are positive semidefinite or diagonally dominant: these need no pivoting, and the search for
@@ -36,7 +36,9 @@ def factors(matrix: csc_array) -> SuperLU:
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
-def solved(matrix: csr_array, right: Float[Floats, "V D"], start: Float[Floats, "V D"]) -> Float[Floats, "V D"]:
+def solve_positive_definite(
+    matrix: csr_array, right: Float[Floats, "V D"], start: Float[Floats, "V D"]
+) -> Float[Floats, "V D"]:
     """Solve a sparse positive definite system for each column of ``right`` by conjugate gradients, from ``start``."""
     V = matrix.shape[0]
     preconditioner = (
@@ -59,7 +61,7 @@ def _multigrid(matrix: csr_array) -> Callable[[Floats], Floats]:
     V, inverse = matrix.shape[0], 1.0 / matrix.diagonal()
     if V <= _MAX_COARSEST:
         regularized = matrix + diags_array(1e-6 * matrix.diagonal())  # regularized: clusters may coincide
-        return factors(csc_array(regularized)).solve
+        return factorize(csc_array(regularized)).solve
     seeds = np.sort(np.random.default_rng(0).choice(V, V // _CLUSTER_SIZE, replace=False))
     graph = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
     nearest = dijkstra(graph, indices=seeds, unweighted=True, return_predecessors=True, min_only=True)[2]
@@ -81,7 +83,7 @@ def _is_cheap(first: csr_array, second: csr_array, entries: int = 0) -> bool:
     return int(np.diff(second.indptr)[first.indices].sum(dtype=np.int64)) <= _MAX_WORK * (entries or first.nnz)
 
 
-def averaged(
+def smooth_values(
     values: Float[Floats, "V D"],
     trust: Float[Floats, " V"],
     edges: Int[Ints, "E 2"],
@@ -96,4 +98,4 @@ def averaged(
     degree = np.maximum(np.bincount(edges.ravel(), minlength=V), 1)
     weight = 4.0 * (radius / np.maximum(length, 0.01 * radius)) ** 2 / degree[edges].mean(axis=1)
     matrix = (laplacian(edges, weight, V) + diags_array(trust)).tocsr()
-    return solved(matrix, trust[:, None] * values, values)
+    return solve_positive_definite(matrix, trust[:, None] * values, values)

@@ -19,12 +19,12 @@ _ELEMENT_ENTRY = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _ENTRY_ELEMENT = np.array([0, 1, 2, 4, 5, 8])
 
 
-def entries_of(matrices: Float[Floats, "G 3 3"]) -> Float[Floats, "6 G"]:
+def to_entries(matrices: Float[Floats, "G 3 3"]) -> Float[Floats, "6 G"]:
     """The six entries of symmetric matrices, as rows."""
     return np.ascontiguousarray(matrices.reshape(-1, 9).T[_ENTRY_ELEMENT])
 
 
-def matrices_of(entries: Float[Floats, "6 G"]) -> Float[Floats, "G 3 3"]:
+def to_matrices(entries: Float[Floats, "6 G"]) -> Float[Floats, "G 3 3"]:
     """Symmetric matrices from their six entries."""
     return np.ascontiguousarray(entries[_ELEMENT_ENTRY].T).reshape(-1, 3, 3)
 
@@ -41,9 +41,9 @@ def logarithm(S: Float[Floats, "6 G"], least: float) -> Float[Floats, "6 G"]:
         high, middle, low = (np.where(nearly_singular, 1.0, each) for each in (high, middle, low))
     result = _newton_polynomial(S, (high, middle, low), np.log(high), slope(high, middle), slope(middle, low))
     if nearly_singular.any():
-        values, axes = np.linalg.eigh(matrices_of(S[:, nearly_singular]))
+        values, axes = np.linalg.eigh(to_matrices(S[:, nearly_singular]))
         logs = np.log(np.maximum(values, least))
-        result[:, nearly_singular] = entries_of((axes * logs[:, None, :]) @ axes.transpose(0, 2, 1))
+        result[:, nearly_singular] = to_entries((axes * logs[:, None, :]) @ axes.transpose(0, 2, 1))
     return result
 
 

@@ -40,13 +40,13 @@ def row_sums(rows: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
     return rows[:, 0] + rows[:, 1] + rows[:, 2]
 
 
-def unit(vectors: Float[Floats, "N D"]) -> Float[Floats, "N D"]:
+def normalized(vectors: Float[Floats, "N D"]) -> Float[Floats, "N D"]:
     """Rows scaled to length 1; zero rows stay zero."""
     lengths = np.sqrt(squared_lengths(vectors))
     return np.asarray(vectors / np.where(lengths > 0, lengths, 1.0)[:, None])
 
 
-def shortest_turns(before: Float[Floats, "N 3"], after: Float[Floats, "N 3"]) -> Float[Floats, "N 3 3"]:
+def rotations_between(before: Float[Floats, "N 3"], after: Float[Floats, "N 3"]) -> Float[Floats, "N 3 3"]:
     """Rotations that take unit vectors ``before`` to ``after`` the shortest way; the identity where either is zero."""
     axis = np.cross(before, after)  # its length is the sine of the angle
     cosine = np.where(squared_lengths(before) * squared_lengths(after) > 0, dot(before, after), 1.0)
@@ -75,14 +75,14 @@ def signed_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
     return np.asarray(0.5 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]))
 
 
-def flat_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
+def planar_areas(corners: Float[Floats, "F 3 2"]) -> Float[Floats, " F"]:
     """Areas of triangles in the plane."""
     return np.asarray(np.abs(signed_areas(corners)))
 
 
 def vertex_areas(verts: Float[Floats, "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, " V"]:
     """A third of the area of the triangles around each vertex."""
-    return share_areas(triangle_areas(verts, faces), faces, len(verts))
+    return areas_to_vertices(triangle_areas(verts, faces), faces, len(verts))
 
 
 def vertex_normals(verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "F 3"]) -> Float[Floats, "V 3"]:
@@ -90,7 +90,7 @@ def vertex_normals(verts: Float[NDArray[Any], "V 3"], faces: Int[NDArray[Any], "
     return average_normals(triangle_vectors(verts, faces), faces, len(verts))
 
 
-def share_areas(areas: Float[Floats, " F"], faces: Int[NDArray[Any], "F 3"], V: int) -> Float[Floats, " V"]:
+def areas_to_vertices(areas: Float[Floats, " F"], faces: Int[NDArray[Any], "F 3"], V: int) -> Float[Floats, " V"]:
     """Distribute areas of triangles to the V vertices, a third to each corner."""
     return np.asarray(np.bincount(faces.ravel(), np.repeat(areas / 3.0, 3), V), np.float64)
 
@@ -101,7 +101,7 @@ def average_normals(vectors: Float[Floats, "F 3"], faces: Int[NDArray[Any], "F 3
     sums = np.empty((V, 3))
     for axis in range(3):
         sums[:, axis] = np.bincount(corners, weights=np.repeat(vectors[:, axis], 3), minlength=V)
-    return unit(sums)
+    return normalized(sums)
 
 
 def interpolate(
@@ -188,7 +188,7 @@ def covering_balls(
     return item, center, radius[item] * (1 + 1e-12)
 
 
-def together(count: int, start: Int[Ints, " N"], end: Int[Ints, " N"]) -> Int[Ints, " count"]:
+def component_minima(count: int, start: Int[Ints, " N"], end: Int[Ints, " N"]) -> Int[Ints, " count"]:
     """Connected components of a graph with ``count`` nodes: the smallest node of each node's component.
 
     For graphs with few edges, where SciPy's sparse graphs cost more.

@@ -21,7 +21,7 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.implicit.fit import ImplicitFit
 from meshmatch.implicit.model import ImplicitModel, percent_of_side
 from meshmatch.implicit.objective import PUBLISHED, ImplicitLoss
-from meshmatch.implicit.samples import load_source, samples_of
+from meshmatch.implicit.samples import load_source, sample_shape
 from meshmatch.models.card import ImplicitCard
 from meshmatch.progress import ProgressCallback
 from meshmatch.shapes.files import ShapeLike, as_shape
@@ -77,7 +77,7 @@ def fit_implicit(
     source = load_source(shape) if isinstance(shape, str | Path) else as_shape(shape)
     name = source.name or "shape"
     rng = np.random.default_rng(seed)
-    frame, found = samples_of(source, _N_SAMPLES, rng, closed=False)
+    frame, found = sample_shape(source, _N_SAMPLES, rng, closed=False)
     rows, half = torch.from_numpy(found), _N_SAMPLES // 2
     turn = best_turn(model, rows[:: _N_SAMPLES // _TURN_SAMPLES])
     notes: tuple[str, ...] = ()

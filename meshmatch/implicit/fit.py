@@ -9,7 +9,7 @@ from typing import Protocol
 
 import torch
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.card import ImplicitCard
@@ -32,7 +32,7 @@ class Owner(Protocol):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ImplicitFit(Brief):
+class ImplicitFit(ShortRepr):
     """The representation of a shape by an implicit model.
 
     Attributes

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32
+from meshmatch.arrays import Float, Floats, Floats32, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import is_watertight
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
-from meshmatch.shapes.input_files import existing, read_npz, suffix_of
+from meshmatch.shapes.input_files import check_input_file, read_npz, suffix_of
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -36,7 +36,7 @@ _SUFFIXES = {*PLAIN_SUFFIXES, ".npz"} - {".npy"}  # .npy files in a folder of sh
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ImplicitSamples(Brief):
+class ImplicitSamples(ShortRepr):
     """N samples of each of S shapes in the cube; the first half is on the surface, or nearest to it.
 
     A row is a point, its signed distance (NaN if it is only known to be off the surface), and its normal (0 if not known).
@@ -58,7 +58,7 @@ def read_implicit_samples(folder: str | Path, seed: int = 0) -> ImplicitSamples:
         hint = f"give a folder of watertight meshes, clouds or .npz ({', '.join(sorted(_SUFFIXES))}), each once"
         raise InputError(f"{folder} has {len(set(names))} shapes of different names; two are needed", hint)
     N = int(np.clip(_MAX_TOTAL // len(files), 1024, _MAX_PER_SHAPE)) // 4 * 4
-    found = [samples_of(file, N, np.random.default_rng([seed, number])) for number, file in enumerate(files)]
+    found = [sample_shape(file, N, np.random.default_rng([seed, number])) for number, file in enumerate(files)]
     frames, rows = zip(*found, strict=True)
     return ImplicitSamples(names, frames, np.stack(rows))
 
@@ -79,7 +79,7 @@ def load_source(file: str | Path) -> Shape:
     return SampledShape(points, np.empty((0, 3), np.int64), Path(file).name, distances=distances, normals=normals)
 
 
-def samples_of(
+def sample_shape(
     source: Shape | str | Path, N: int, rng: np.random.Generator, closed: bool = True
 ) -> tuple[Frame, Float[Floats32, "N 7"]]:
     """Return the frame of a shape or a file, and ``N`` samples (a multiple of 4) as in `ImplicitSamples`.
@@ -122,7 +122,7 @@ def samples_of(
 
 def _read_samples(file: Path) -> tuple[Floats, Floats, Floats]:
     """Read points, and either distances or normals; the other array is empty."""
-    arrays = read_npz(existing(file), ARRAYS)
+    arrays = read_npz(check_input_file(file), ARRAYS)
     points, distances, normals = (np.asarray(arrays.get(name, ())) for name in ARRAYS)
     matching = distances.shape == points.shape[:1] or normals.shape == points.shape
     if not (points.ndim == 2 and points.shape[1] == 3 and matching and len(points)):

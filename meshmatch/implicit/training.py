@@ -21,7 +21,7 @@ from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.registry import WEIGHTS
 from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes.sampling import farthest_points
-from meshmatch.training.alone import CHECKPOINT, alone
+from meshmatch.training.folder_lock import CHECKPOINT, exclusive_folder
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.train import CardFacts
 
@@ -66,7 +66,7 @@ def build_implicit(samples: ImplicitSamples, config: ImplicitConfig, seed: int) 
     return ImplicitNetwork(config, len(samples.names), torch.from_numpy(np.concatenate([inner, outer])).float(), radii)
 
 
-@alone
+@exclusive_folder
 def train_implicit(
     output: str | Path,
     shapes: str | Path | ImplicitSamples,

@@ -8,7 +8,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import OptionError
-from meshmatch.maps.parts import kept_together
+from meshmatch.maps.parts import match_parts
 from meshmatch.maps.places import PlacedFit, Places
 from meshmatch.maps.vertex_map import VERDICTS, VertexMap
 from meshmatch.shapes.shape import Shape
@@ -38,7 +38,7 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     if source.template_hash != target.template_hash:
         both = f"{source.template_hash}, {target.template_hash}"
         raise OptionError(f"the fits use different templates ({both})", "fit both shapes with the same model")
-    found = kept_together(source, target, target.nearest(source.resting, workers), workers)
+    found = match_parts(source, target, target.nearest(source.resting, workers), workers)
     along = np.square(found.distance) - np.square(source.height - target.height[found.vertex])
     squared = np.square(source.distance) + np.square(target.distance[found.vertex]) + np.maximum(along, 0.0)
     doubt = squared / _DISTANCE_SCALE**2
@@ -64,12 +64,12 @@ def build_map(source: Places, target: Places, workers: int = 1) -> VertexMap:
     )
 
 
-def map_of_placed(source: PlacedFit, target: PlacedFit) -> VertexMap:
+def map_between_fits(source: PlacedFit, target: PlacedFit) -> VertexMap:
     """Map between two fits of a folder, as `build_map`, with the up axes of their files."""
     return replace(build_map(source.places, target.places), source_up=source.up, target_up=target.up)
 
 
-def judged_by_pairs(
+def judge_by_pairs(
     found: VertexMap, target: Shape, pairs: tuple[Int[Ints, " N"], Int[Ints, " N"]], unit: float
 ) -> VertexMap:
     """Return the map with its verdict lowered, and reasons added, by how well it reproduces known pairs.

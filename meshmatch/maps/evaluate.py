@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32, Pickled, as_array, as_numbers, frozen, table_html
+from meshmatch.arrays import (
+    Float,
+    Floats,
+    Floats32,
+    PickledFields,
+    ShortRepr,
+    as_array,
+    as_numbers,
+    set_read_only,
+    table_html,
+)
 from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import dot, squared_lengths, triangle_vectors
 from meshmatch.maps.folds import Folds
@@ -115,7 +125,7 @@ class SurfaceDistance:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Errors(Brief, Pickled):
+class Errors(ShortRepr, PickledFields):
     """Errors of a map, one for each point with known ground truth.
 
     An error is the geodesic distance between the predicted and the true point on the target, divided by the square root of
@@ -143,7 +153,7 @@ class Errors(Brief, Pickled):
         values = as_numbers(self.values, "errors").astype(np.float32).reshape(-1)
         if not values.size or not np.isfinite(values).all() or values.min() < 0:
             raise InputError("there must be errors, all finite and 0 or more")
-        object.__setattr__(self, "values", frozen(values))
+        object.__setattr__(self, "values", set_read_only(values))
 
     @property
     def cm(self) -> Float[Floats32, " N"]:

@@ -28,7 +28,7 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.input_files import check_memory, read_bytes, read_json, read_npy, read_npz
-from meshmatch.shapes.tables import read_table, whole
+from meshmatch.shapes.tables import as_whole_numbers, read_table
 
 CSV_COLUMNS = ("source_vertex", "target_vertex", "face", "w0", "w1", "w2", "confidence")
 _ARRAY_FIELDS = ("index", "face", "barycentric", "confidence")
@@ -147,7 +147,7 @@ def _write_txt(path: Path, m: VertexMap) -> None:
 
 
 def _read_txt(path: Path) -> dict[str, Any]:
-    return _index_record(whole(read_table(path, comments="ends", whole=True).numbers()[1]))
+    return _index_record(as_whole_numbers(read_table(path, comments="ends", whole=True).numbers()[1]))
 
 
 def _write_npz(path: Path, m: VertexMap) -> None:

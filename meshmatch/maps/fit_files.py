@@ -91,7 +91,7 @@ def write_fit(
     save_arrays(path, arrays, {"fit": json.dumps(header, sort_keys=True)})
 
 
-def load_words(path: str | Path) -> tuple[Words, Words]:
+def read_fit_header(path: str | Path) -> tuple[Words, Words]:
     """Read the header of a fit's file: the fit's fields and the extra metadata, without arrays. Errors as `read_fit`."""
     path = Path(path)
     try:
@@ -118,7 +118,7 @@ def load_words(path: str | Path) -> tuple[Words, Words]:
 def read_fit(path: str | Path, template: Template) -> StoredFit:
     """Read a fit of this template; `InputError` if the file is missing, damaged, of another schema or template."""
     path = Path(path)
-    about, more = load_words(path)
+    about, more = read_fit_header(path)
     try:
         with safe_open(str(path), framework="np") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)

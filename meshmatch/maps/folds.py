@@ -13,13 +13,13 @@ from meshmatch.geometry.triangles import (
     cross_product,
     dot,
     interpolate,
+    normalized,
     squared_lengths,
     triangle_vectors,
-    unit,
 )
-from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.faces import turn_faces
+from meshmatch.shapes.faces import orient_faces
 from meshmatch.shapes.shape import Shape
 
 _ROUNDING = 1e-6  # area ratios are rounded by this much: an image without area is not flipped
@@ -53,7 +53,7 @@ class Folds:
         points, verts = found.points(target) / _scale(target), source.verts / _scale(source)
         faces, areas = consistent_faces(source)[source.valid_faces], source.face_areas[source.valid_faces]
         normals = normals_at(found, target)
-        normals *= 1.0 if facing(points, normals, verts, faces) >= 0 else -1.0
+        normals *= 1.0 if orientation_agreement(points, normals, verts, faces) >= 0 else -1.0
         ratio = area_ratios(points, normals, verts, faces)
         known = np.isfinite(ratio) & (areas > 0)
         if not known.any():
@@ -67,7 +67,7 @@ class Folds:
         return cls(float(share[flipped].sum()), float(share[crushed].sum()), float(factor[middle]))
 
 
-def known_normals(shape: Shape) -> Float[Floats, "V 3"]:
+def normals_or_zeros(shape: Shape) -> Float[Floats, "V 3"]:
     """Unit vertex normals of a mesh; zeros for a cloud, whose orientation is unknown."""
     if shape.is_cloud:
         return np.zeros_like(shape.verts)
@@ -80,17 +80,17 @@ def consistent_faces(shape: Shape) -> Int[Ints, "F 3"]:
     """Faces reoriented so that neighbors have the same winding, which those of a file need not have."""
     edges = shape.edges
     return (
-        turn_faces(shape.verts, shape.faces, shape.face_vectors, edges)[0] if edges.disagreeing.any() else shape.faces
+        orient_faces(shape.verts, shape.faces, shape.face_vectors, edges)[0] if edges.disagreeing.any() else shape.faces
     )
 
 
 def normals_at(found: VertexMap, target: Shape) -> Float[Floats, "V_source 3"]:
     """Unit normals of the target at the images of the source's vertices; zeros on a cloud."""
     corners = corners_of(target.faces, found.face, found.index)
-    return unit(interpolate(known_normals(target), corners, found.barycentric))
+    return normalized(interpolate(normals_or_zeros(target), corners, found.barycentric))
 
 
-def facing(
+def orientation_agreement(
     points: Float[Floats, "V 3"], normals: Float[Floats, "V 3"], verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]
 ) -> float:
     """Area-weighted mean of +1 for triangles that keep their orientation and -1 for others, from 1 to -1.
@@ -135,7 +135,7 @@ def _stretch_factors(points: Floats, normals: Floats, verts: Floats, faces: Ints
 
 
 def _unit_face_normals(normals: Floats, faces: Ints) -> Floats:
-    return unit(sum(normals.take(faces[:, k], 0) for k in range(3)))  # type: ignore[arg-type]
+    return normalized(sum(normals.take(faces[:, k], 0) for k in range(3)))  # type: ignore[arg-type]
 
 
 def _scale(shape: Shape) -> float:

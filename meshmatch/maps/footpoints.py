@@ -31,7 +31,7 @@ from meshmatch.geometry.triangles import (
     squared_lengths,
     vertex_normals,
 )
-from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.indices import corners_of
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import eigsh
 
-from meshmatch.arrays import Brief, Float, Floats, Pickled, as_numbers, frozen
+from meshmatch.arrays import Float, Floats, PickledFields, ShortRepr, as_numbers, set_read_only
 from meshmatch.errors import InputError
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
@@ -23,7 +23,7 @@ _INFO_HINT = "meshmatch info FILE says what is in it"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LaplacianBasis(Brief, Pickled):
+class LaplacianBasis(ShortRepr, PickledFields):
     """The first K eigenfunctions of the Laplacian of a shape.
 
     They are orthonormal: ``vectors.T @ (mass[:, None] * vectors)`` is the identity.
@@ -102,7 +102,7 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
     vectors = vectors * np.sign(np.take_along_axis(vectors, np.abs(vectors).argmax(0)[None], 0))
     order = np.argsort(values)
     scaled = vectors[:, order] / unit, values[order].clip(min=0.0) / unit**2, areas * unit**2
-    return LaplacianBasis(*map(frozen, scaled))
+    return LaplacianBasis(*map(set_read_only, scaled))
 
 
 def map_from_functional(

@@ -21,10 +21,10 @@ from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.derived import derived
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import closest_on_triangles, covering_balls, face_parts, interpolate, squared_lengths
-from meshmatch.maps.folds import known_normals, normals_at
+from meshmatch.maps.folds import normals_at, normals_or_zeros
 from meshmatch.maps.footpoints import Footpoints, reassign_islands
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.faces import seams
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
@@ -241,7 +241,7 @@ def connected_parts(shape: Shape) -> Int[Ints, " V"]:
     faces = shape.faces[shape.valid_faces]
     part = np.full(shape.V, -1, np.int64)
     if len(faces):
-        twin = seams(shape.verts, faces)
+        twin = seam_representatives(shape.verts, faces)
         part[faces] = face_parts(twin[faces], shape.V)[:, None]
     return part
 
@@ -262,7 +262,7 @@ def invert_map(source_to_target: VertexMap, source: Shape, target: Shape, worker
     if source.hash == target.hash and target.invalid is None and identical:
         return replace(checked, source=target.name, target=source.name)
     image = MappedMesh(checked, source, target)
-    normals, parts = known_normals(target), connected_parts(target)
+    normals, parts = normals_or_zeros(target), connected_parts(target)
     found = image.query(target.verts, normals, workers, parts=parts)
     shared, vertex = _shared_images(checked, source, target.V)
     weights = np.tile([1.0, 0.0, 0.0], (len(shared), 1))

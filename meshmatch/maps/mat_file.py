@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.input_files import ROOM
+from meshmatch.shapes.input_files import MEMORY_ALLOWANCE
 
 Value = NDArray[np.generic] | str | list[str]
 """Numbers in the array's own shape; the characters of a text, row by row; the texts of a cell array."""
@@ -39,7 +39,7 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     if order is None:
         raise InputError("it is not a MAT-file of version 5 to 7", _HINT)
     wanted, found = set(names), {}
-    left = min(LARGEST, len(data) + ROOM // 4)  # up to four copies of the data exist during reading
+    left = min(LARGEST, len(data) + MEMORY_ALLOWANCE // 4)  # up to four copies of the data exist during reading
     try:
         for kind, body in _elements(data[_HEADER:], order):
             if kind == _COMPRESSED:

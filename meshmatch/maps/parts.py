@@ -26,7 +26,7 @@ _MIN_PARTS, _MIN_SHARE, _MAX_SHARE = 4, 0.01, 0.6
 _MIN_OVERLAP = 0.65
 
 
-def kept_together(source: Places, target: Places, found: Footpoints, workers: int = 1) -> Footpoints:
+def match_parts(source: Places, target: Places, found: Footpoints, workers: int = 1) -> Footpoints:
     """Move footpoints of source vertices onto the counterparts of their parts.
 
     Footpoints ``found`` that lie on a counterpart already are unchanged, as are all if either shape is not multipart.

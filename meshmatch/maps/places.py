@@ -18,11 +18,11 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix, identity, vstack
 
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Floats32, Int, Ints, Ints32
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, Ints32, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit import Fit, check_fit
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import blend, share_areas, triangle_areas, vertex_areas, vertex_normals
+from meshmatch.geometry.triangles import areas_to_vertices, blend, triangle_areas, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Footpoints, Surface, closest_footpoints, in_core_frame, template_footpoints
 from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.repair import Repaired
@@ -39,7 +39,7 @@ _CHUNK = 8192  # points per chunk
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Places(Brief):
+class Places(ShortRepr):
     """Places of one shape's vertices on the rest template. Those of two shapes, on one template, make a map.
 
     Vertices and faces are those of the shape's file, lengths in units of sqrt(area).
@@ -229,8 +229,8 @@ def _displacement_on_rest(before: Fit, after: Fit) -> Float[Floats, "V 3"]:
     along = np.linalg.solve(gram, (edges @ slid[..., None]))[..., 0]
     moves = np.clip((along[:, None] @ resting)[:, 0], -1.0, 1.0)  # bounds the moves of degenerate triangles
     area = triangle_areas(after.resting, faces)
-    total = share_areas(area, faces, len(after.points))
-    sums = np.stack([share_areas(area * column, faces, len(after.points)) for column in moves.T], 1)
+    total = areas_to_vertices(area, faces, len(after.points))
+    sums = np.stack([areas_to_vertices(area * column, faces, len(after.points)) for column in moves.T], 1)
     return np.asarray(sums / np.maximum(total, 1e-300)[:, None])
 
 

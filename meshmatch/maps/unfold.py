@@ -22,23 +22,30 @@ from scipy.sparse.linalg import splu
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.derived import derived
-from meshmatch.geometry.disks import Disk, found_in, mean_values, patches
+from meshmatch.geometry.disks import Disk, edge_connected_patches, locate_points, mean_values
 from meshmatch.geometry.triangles import (
     FacesAround,
     dot,
     edge_lengths,
     interpolate,
+    normalized,
     squared_lengths,
     triangle_areas,
     triangle_vectors,
-    unit,
 )
-from meshmatch.maps.folds import CRUSHED_RATIO, area_ratios, consistent_faces, facing, known_normals, normals_at
+from meshmatch.maps.folds import (
+    CRUSHED_RATIO,
+    area_ratios,
+    consistent_faces,
+    normals_at,
+    normals_or_zeros,
+    orientation_agreement,
+)
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map, length_of
-from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.faces import seams
-from meshmatch.shapes.normalise import in_single_precision
+from meshmatch.shapes.alignment import in_single_precision
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
@@ -58,7 +65,7 @@ _EPSILON = 1e-6  # area ratios and barycentric weights below this are 0
 _REGULARIZATION = 1e-3  # pull of each image to where it was, so that every component has a solution
 
 
-def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
+def unfold(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -> VertexMap:
     """Reduce the folds of a map; a map without folds, or of clouds or very large meshes, is returned unchanged."""
     if source.is_cloud or target.is_cloud or max(source.V, target.V) > _MAX_VERTICES:
         return found
@@ -75,7 +82,7 @@ def unfolded(found: VertexMap, source: Shape, target: Shape, workers: int = 1) -
     return _between_files(images.map, found, own, target, np.flatnonzero(moved[own.number]))
 
 
-def unfolded_both_ways(
+def unfold_both_ways(
     found: VertexMap, opposite: VertexMap, source: Shape, target: Shape, workers: int = 1
 ) -> tuple[VertexMap, VertexMap]:
     """Reduce the folds of a map, and return it with its inverse, which has few folds as well.
@@ -86,7 +93,7 @@ def unfolded_both_ways(
     """
     own, theirs = _welded(source), _welded(target)
     if theirs.order < own.order:
-        backward, forward = unfolded_both_ways(opposite, found, target, source, workers)
+        backward, forward = unfold_both_ways(opposite, found, target, source, workers)
         return forward, backward
     images = _Images(_between_welded(found, own, theirs), own.shape, theirs.shape, workers)
     images.repeat(images.reconstruct, _POISSON_RINGS)
@@ -130,7 +137,7 @@ class _Welded:
 @derived
 def _welded(shape: Shape) -> _Welded:
     shape = in_single_precision(shape)
-    twin = seams(shape.verts, shape.faces[shape.valid_faces])
+    twin = seam_representatives(shape.verts, shape.faces[shape.valid_faces])
     first, begins = np.unique(np.concatenate([twin[shape.faces].ravel(), twin]), return_index=True)
     first = first[np.argsort(begins)]
     number = np.empty(shape.V, np.int64)
@@ -174,10 +181,10 @@ class _Images:
         kept = 2 * triangle_areas(self.verts, faces) > _MIN_ASPECT * longest
         self.faces, self.face_in_file = faces[kept], np.flatnonzero(source.valid_faces)[kept]
         self.normals = normals_at(found, target)
-        self.side = 1.0 if facing(self.points, self.normals, self.verts, self.faces) >= 0 else -1.0
+        self.side = 1.0 if orientation_agreement(self.points, self.normals, self.verts, self.faces) >= 0 else -1.0
         self.normals *= self.side
         self.target = Shape(target.verts / length_of(target), target.faces, invalid=target.invalid)
-        self.upwards = known_normals(target)
+        self.upwards = normals_or_zeros(target)
         self.areas = triangle_areas(self.verts, self.faces)
         self.ratio = _ratios(self.points, self.normals, self.verts, self.faces)
         self.torn = _torn_faces(self.points, self.verts, self.faces)
@@ -220,7 +227,7 @@ class _Images:
         means = diags_array(1 / weights.sum(axis=1)) @ weights
         points, normals = self.points.copy(), self.normals.copy()
         for _ in range(_SMOOTHING_STEPS):
-            found = self._on_surface(rows, means @ points, unit(means @ normals))
+            found = self._on_surface(rows, means @ points, normalized(means @ normals))
             points[rows], normals[rows] = found.points, found.normals
         self._improve(rows, near, found)
         return True
@@ -233,7 +240,7 @@ class _Images:
         inside, zone = np.zeros((2, len(self.faces)), bool)
         inside[near] = True
         zone[self._dilated(self.faces[near].ravel(), _CLOSING_RINGS)[self.faces].all(axis=1)] = True
-        for patch in patches(self.faces, inside, zone | inside):
+        for patch in edge_connected_patches(self.faces, inside, zone | inside):
             disk = Disk.of(self.faces, patch)
             if disk is not None and (self.ratio[patch] <= least).any():
                 any(self._flatten_patch(disk, reach) for reach in _MARGINS)
@@ -255,7 +262,7 @@ class _Images:
         places = disk.laid_flat(self.verts, interpolate(plane, corners, self.weights[rim]), self.side)
         if places is None:
             return False
-        face, weights, _ = found_in(plane, beneath.corners, np.delete(places, disk.rim, axis=0))
+        face, weights, _ = locate_points(plane, beneath.corners, np.delete(places, disk.rim, axis=0))
         corners = self.target.faces[beneath.faces[face]]
         found = self._interpolated(corners, beneath.faces[face], weights)
         near = self.around.at(rows)
@@ -264,7 +271,7 @@ class _Images:
         before, folded = self._get(rows), self._fold_cost(near)
         if not self._improve(rows, near, found):
             return False
-        face, weights, inside = found_in(places, disk.corners, plane)
+        face, weights, inside = locate_points(places, disk.corners, plane)
         others = beneath.vertices[inside]
         changed = self.opposite.around.at(others)
         others_before, folded = self.opposite._get(others), folded + self.opposite._fold_cost(changed)
@@ -294,7 +301,7 @@ class _Images:
         away = dijkstra(self._edge_graph, indices=np.unique(self._corners(disk.vertices)), min_only=True, limit=2 * far)
         subset = self.around_target.at(np.flatnonzero(np.isfinite(away)))
         away = away[faces[subset]].max(axis=1)
-        found = patches(faces[subset], away <= far, away <= 2 * far)
+        found = edge_connected_patches(faces[subset], away <= far, away <= 2 * far)
         return Disk.of(faces, subset[found[0]]) if len(found) == 1 else None
 
     def _corners(self, rows: Ints) -> Ints:
@@ -366,8 +373,8 @@ class _Images:
     def _gradients(self, subset: Ints) -> Floats:
         """(N, 3, 3) deformation gradients of triangles and their normals."""
         corners = self.faces[subset]
-        normal = unit(triangle_vectors(self.verts, corners))
-        facing = unit(self.normals[corners].sum(axis=1))
+        normal = normalized(triangle_vectors(self.verts, corners))
+        facing = normalized(self.normals[corners].sum(axis=1))
         before, after = (
             np.stack([each[corners[:, 1]] - each[corners[:, 0]], each[corners[:, 2]] - each[corners[:, 0]], up], axis=2)
             for each, up in ((self.verts, normal), (self.points, facing))
@@ -425,13 +432,13 @@ class _Images:
             self.surface = MappedMesh.of(self.target)
         foot = self.surface.query(wanted, self.side * facing, self.workers, parts=self.surface.part[self.index[rows]])
         points = foot.values(self.target.faces, self.target.verts)
-        normals = self.side * unit(foot.values(self.target.faces, self.upwards))
+        normals = self.side * normalized(foot.values(self.target.faces, self.upwards))
         return _Positions(foot.vertex, foot.face, foot.barycentric, points, normals)
 
     def _interpolated(self, corners: Ints, face: Ints, weights: Floats) -> _Positions:
         """Positions from barycentric weights and corners (N, 3) of the target's faces."""
         points = interpolate(self.target.verts, corners, weights)
-        normals = self.side * unit(interpolate(self.upwards, corners, weights))
+        normals = self.side * normalized(interpolate(self.upwards, corners, weights))
         return _Positions(_heaviest(corners, weights), face, weights, points, normals)
 
     def _get(self, rows: Ints) -> _Positions:

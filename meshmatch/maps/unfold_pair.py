@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshmatch.arrays import Int, Ints
-from meshmatch.maps.unfold import unfolded, unfolded_both_ways
+from meshmatch.maps.unfold import unfold, unfold_both_ways
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 _MAX_BOTH_WAYS = 60_000  # vertices up to which both maps are unfolded together: beyond, that takes longer than matching
 
 
-def unfolded_pair(
+def unfold_pair(
     found: VertexMap, opposite: Callable[[], VertexMap], source: Shape, target: Shape, partial: bool, workers: int = 1
 ) -> tuple[VertexMap, VertexMap | None]:
     """Reduce the folds of a map between two shapes.
@@ -35,21 +35,21 @@ def unfolded_pair(
     if inside is None:
         return found, None
     if partial or found.verdict != "good" or max(a.shape.V, b.shape.V) > _MAX_BOTH_WAYS:
-        return a.in_file(unfolded(inside, a.shape, b.shape, workers), found, b), None
+        return a.in_file(unfold(inside, a.shape, b.shape, workers), found, b), None
     back = opposite()
     inside_back = b.between(back, a)
     if inside_back is None:
-        return a.in_file(unfolded(inside, a.shape, b.shape, workers), found, b), None
-    forward, backward = unfolded_both_ways(inside, inside_back, a.shape, b.shape, workers)
+        return a.in_file(unfold(inside, a.shape, b.shape, workers), found, b), None
+    forward, backward = unfold_both_ways(inside, inside_back, a.shape, b.shape, workers)
     return a.in_file(forward, found, b), b.in_file(backward, back, a)
 
 
-def both_unfolded(
+def unfold_both(
     found: VertexMap, opposite: VertexMap, source: Shape, target: Shape, partial: bool
 ) -> tuple[VertexMap, VertexMap]:
-    """Reduce the folds of a map and of its opposite: together where `unfolded_pair` does so, otherwise independently."""
-    forward, backward = unfolded_pair(found, lambda: opposite, source, target, partial)
-    return forward, backward or unfolded_pair(opposite, lambda: found, target, source, partial=True)[0]
+    """Reduce the folds of a map and of its opposite: together where `unfold_pair` does so, otherwise independently."""
+    forward, backward = unfold_pair(found, lambda: opposite, source, target, partial)
+    return forward, backward or unfold_pair(opposite, lambda: found, target, source, partial=True)[0]
 
 
 @dataclass(frozen=True, eq=False)

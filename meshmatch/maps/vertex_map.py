@@ -17,17 +17,17 @@ from meshmatch.arrays import (
     Floats32,
     Int,
     Ints,
-    Pickled,
+    PickledFields,
     SomeTensor,
+    as_integers,
     as_numbers,
-    frozen,
-    whole_numbers,
+    set_read_only,
 )
 from meshmatch.errors import InputError
 from meshmatch.fields.local_fits import product
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.named_places import UNKNOWN as UNKNOWN
-from meshmatch.maps.named_places import check_faces, check_range, corners_of
+from meshmatch.maps.indices import UNKNOWN as UNKNOWN
+from meshmatch.maps.indices import check_faces, check_range, corners_of
 from meshmatch.shapes.shape import Shape, checked_shape
 
 DIRECTION = "index[i] is the vertex of the target matched to vertex i of the source"
@@ -41,7 +41,7 @@ _READ_WITH_SHAPES_HINT = "read it with load_map(path, source, target)"
 
 
 @dataclass(frozen=True, eq=False)
-class VertexMap(Pickled):
+class VertexMap(PickledFields):
     """A map from every vertex of a source to a target: *index[i] is the vertex of the target matched to vertex i of the
     source.*
 
@@ -124,7 +124,7 @@ class VertexMap(Pickled):
             if axis not in _UP_AXES:
                 raise InputError(f"{label}: up is one of {', '.join(_UP_AXES[1:])}, not '{axis[:20]}'")
         for name, array in arrays.items():
-            object.__setattr__(self, name, frozen(array))
+            object.__setattr__(self, name, set_read_only(array))
         if self.target_faces is not None:
             check_faces(self.face, len(self.target_faces), label)
         object.__setattr__(self, "reasons", tuple(str(reason) for reason in self.reasons))
@@ -133,13 +133,13 @@ class VertexMap(Pickled):
     @np.errstate(invalid="ignore")  # signaling nan; refused below
     def _checked_arrays(self, label: str) -> dict[str, NDArray[Any]]:
         """Return copies of the arrays, with defaults filled in; `InputError` if one is invalid."""
-        vertex = whole_numbers(self.index, f"{label}: index")
+        vertex = as_integers(self.index, f"{label}: index")
         if vertex.ndim != 1 or (size := len(vertex)) == 0:
             raise InputError(f"{label}: index must be a list of (V_source,) vertices, not an array of {vertex.shape}")
         if self.target_vertices != UNKNOWN and self.target_vertices < 1:
             raise InputError(f"{label}: a target needs vertices, not {self.target_vertices}")
         check_range(vertex, self.target_vertices, label)
-        faces = np.full(size, -1) if self.face is None else whole_numbers(self.face, f"{label}: face")
+        faces = np.full(size, -1) if self.face is None else as_integers(self.face, f"{label}: face")
         weights_given = np.eye(1, 3).repeat(size, 0) if self.barycentric is None else self.barycentric
         weights = np.array(as_numbers(weights_given, f"{label}: barycentric"))
         confidence_given = np.full(size, np.nan) if self.confidence is None else self.confidence
@@ -184,7 +184,7 @@ class VertexMap(Pickled):
             As for the class, or the target lacks a face that the map names.
         """
         fields = _side_fields("source", source) | _side_fields("target", target)
-        return cls(index=whole_numbers(index, "index"), target_faces=target.faces, **fields, **rest)
+        return cls(index=as_integers(index, "index"), target_faces=target.faces, **fields, **rest)
 
     @classmethod
     def identity(cls, shape: Shape) -> VertexMap:

@@ -1,7 +1,7 @@
 """Load and evaluate networks: in NumPy for matching (`NodeNetwork`), or in torch for pointwise fields and on a GPU.
 
 The layers are few, dense and small: their weights are read from memory once per batch, so that twenty clouds cost about
-as much as four. Fits of many shapes have few clouds each, and evaluate them in common batches (`meshmatch.gathering`);
+as much as four. Fits of many shapes have few clouds each, and evaluate them in common batches (`meshmatch.batching`);
 results are bitwise those of separate calls. `models.deformer` is the same network in torch; a test compares the two.
 """
 
@@ -16,9 +16,9 @@ import numpy as np
 from scipy.special import erf
 
 from meshmatch.arrays import Float, Floats, Floats32
+from meshmatch.batching import batched_call
 from meshmatch.errors import OptionError, needs
-from meshmatch.gathering import gathered
-from meshmatch.geometry.oriented import nearest, quick_tree
+from meshmatch.geometry.oriented import nearest_by_brute_force, quick_tree
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.network import POINT_SIZES, Network, NetworkConfig, weight_shapes
@@ -99,7 +99,7 @@ class NodeNetwork:
         return self.weights["aligner.basis"]
 
     def predict(self, clouds: Sequence[Float[Floats, "P 3"]]) -> Float[Floats, "B K 3"]:
-        return gathered(self.predict_each, clouds)
+        return batched_call(self.predict_each, clouds)
 
     def predict_each(self, requests: Sequence[Clouds]) -> list[Float[Floats, "B K 3"]]:
         """Evaluate `predict` for several requests in one batch.
@@ -136,7 +136,7 @@ class NodeNetwork:
         if self.config.encoder == "point":
             return np.stack([self._encode_points(cloud) for cloud in clouds])
         basis = self.weights["encoder.basis"]
-        offsets = parallel_map(lambda cloud: 5 * (cloud[nearest(cloud, basis)] - basis), clouds)
+        offsets = parallel_map(lambda cloud: 5 * (cloud[nearest_by_brute_force(cloud, basis)] - basis), clouds)
         return self._residual_mlp("encoder.network", np.stack(offsets).reshape(len(clouds), -1), sizes)
 
     def _encode_points(self, cloud: Float[Floats32, "P 3"]) -> Float[Floats32, " D"]:
@@ -250,7 +250,7 @@ def _two_way_offsets(anchors: Float[Floats32, "A 3"], points: Floats32, tree: cK
     """(A, 7) features of a correction; see `models.layers.two_way_offsets`."""
     A = len(anchors)
     forward = points[tree.query(anchors)[1]] - anchors
-    owner = nearest(anchors, points)
+    owner = nearest_by_brute_force(anchors, points)
     back = points - anchors[owner]
     count = np.bincount(owner, minlength=A).astype(np.float32)[:, None]
     total = np.stack([np.bincount(owner, back[:, k], A) for k in range(3)], 1).astype(np.float32)

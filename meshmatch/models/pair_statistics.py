@@ -14,7 +14,7 @@ from safetensors.numpy import load_file, save_file
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import ModelError
-from meshmatch.geometry.symmetric import entries_of, matrices_of
+from meshmatch.geometry.symmetric import to_entries, to_matrices
 from meshmatch.models.tensor_file import read_header
 from meshmatch.outputs import replace_on_success
 
@@ -80,12 +80,12 @@ class PairStatistics:
 
 def flat(matrices: Float[Floats, "G 3 3"]) -> Float[Floats, " D"]:
     """Flatten symmetric matrices into one vector, whose length is their Frobenius norm."""
-    return np.asarray((entries_of(matrices) * _ENTRY_SCALES).reshape(-1))
+    return np.asarray((to_entries(matrices) * _ENTRY_SCALES).reshape(-1))
 
 
 def unflat(vector: Float[Floats, " D"]) -> Float[Floats, "G 3 3"]:
     """Inverse of `flat`."""
-    return matrices_of(vector.reshape(6, -1) / _ENTRY_SCALES)
+    return to_matrices(vector.reshape(6, -1) / _ENTRY_SCALES)
 
 
 def save_pair_statistics(found: PairStatistics, path: str | Path, words: dict[str, str]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from meshmatch.arrays import Float, Floats, table_html
-from meshmatch.derived import derived, remember
+from meshmatch.derived import derived, store_derived
 from meshmatch.errors import ModelError
 from meshmatch.fields.shape_functions import ShapeFunctions, has_nodes, shape_functions
 from meshmatch.geometry.kernels import KERNELS
@@ -81,7 +81,7 @@ class TrainedModel:
             weights = {name: value.numpy(force=True) for name, value in network.state_dict().items()}
             inference = NodeNetwork(network.config, weights)
         made = cls(card, template, inference)
-        remember(torch_network, made, network)
+        store_derived(torch_network, made, network)
         return made
 
     def __reduce__(self) -> tuple[Callable[..., TrainedModel], tuple[Any, ...]]:

@@ -83,7 +83,7 @@ def draw_lines(
         figure.legend(loc="outside upper left", ncols=max(1, min(len(lines), 88 // (6 + max(map(len, lines))))))
 
 
-def draw_beside(
+def draw_panels(
     charts: Mapping[str, tuple[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]]],
     path: str | Path,
     xlabel: str,

@@ -18,7 +18,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM, Errors, ErrorUnit
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.facing import Rotations, same_side, snap_upright
+from meshmatch.render.facing import Rotations, rotations_to_same_side, snap_upright
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, render_shapes
 from meshmatch.render.scales import CLAY, Legend, Scale, label_swatches, position_colors
@@ -88,7 +88,7 @@ def compose_match(
 
     `InputError` for a map that is not of these shapes.
     """
-    turns = same_side(source, target, vertex_map, rotations, look.up, look.front)
+    turns = rotations_to_same_side(source, target, vertex_map, rotations, look.up, look.front)
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
     panels = _colored_panels((source, target), (here, there))
@@ -117,7 +117,7 @@ def compose_confidence(source: Shape, target: Shape, vertex_map: VertexMap, look
     panels = _colored_panels((source, target), [scale.colors(each.confidence) for each in maps])
     record = {"confidence_mean": float(vertex_map.confidence.mean())}
     shown = Composition(panels, scale, "the confidence of the map", record)
-    return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
+    return shown.rotated(rotations_to_same_side(source, target, vertex_map, up=look.up, front=look.front))
 
 
 def compose_errors(
@@ -138,7 +138,7 @@ def compose_errors(
     record = {"points": int(values.size), "unit": unit.name, "mean": unit.factor * errors.mean}
     record |= {"mean_cm": errors.mean_cm, "mean_x100": 100 * errors.mean}
     shown = Composition(tuple(panels), replace(scale, unknown=gaps), "the errors of the map", record)
-    return shown.rotated(same_side(source, target, vertex_map, up=look.up, front=look.front))
+    return shown.rotated(rotations_to_same_side(source, target, vertex_map, up=look.up, front=look.front))
 
 
 def _value_panel(shape: Shape, vertices: Int[Ints, " N"], values: Float[Floats, " N"], scale: Scale) -> Panel:
@@ -268,7 +268,7 @@ def _sample_line(line: Float[Floats, "M 3"], step: float) -> Float[Floats, "N 3"
     return np.column_stack([np.interp(samples, at, line[:, axis]) for axis in range(3)])
 
 
-def compose_worn(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:
+def compose_garments(bodies: Sequence[Shape], worn: Sequence[Shape]) -> Composition:
     """Each body in grey, with what it wears in the first color of labels."""
     cloth = label_colors(np.zeros(1, np.int64))
     panels = []

@@ -30,7 +30,7 @@ _NEAR_AXIS = np.cos(np.radians(35.0))
 _TORSO_RADIUS = 0.2  # half width of the chest without arms
 
 
-def facing(shape: Shape, up: str | None = None, front: str | None = None) -> Rotation:
+def guess_rotation(shape: Shape, up: str | None = None, front: str | None = None) -> Rotation:
     """Rotation into y up, z to the front, by named axes of the file; axes that are not named are guessed. `OptionError` for
     an axis other than x, y, z, -x, -y, -z, or the same axis twice.
     """
@@ -61,7 +61,7 @@ def snap_upright(rotation: Rotation) -> Rotation:
     return rotation if rotation[1] @ upward < _NEAR_AXIS else _rotation_from(upward, rotation[2])
 
 
-def same_side(
+def rotations_to_same_side(
     source: Shape,
     target: Shape,
     vertex_map: VertexMap,
@@ -76,14 +76,14 @@ def same_side(
     """
     first, second = (None if rotation is None else snap_upright(rotation) for rotation in rotations)
     if first is None:
-        first = facing(source, up, front)
+        first = guess_rotation(source, up, front)
     if second is None:
         named = up is not None or front is not None
-        second = facing(target, up, front) if named else facing_matched(source, target, vertex_map, first)
+        second = guess_rotation(target, up, front) if named else rotation_by_map(source, target, vertex_map, first)
     return first, second
 
 
-def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation: Rotation) -> Rotation:
+def rotation_by_map(source: Shape, target: Shape, vertex_map: VertexMap, rotation: Rotation) -> Rotation:
     """Rotation that shows the target from the side from which ``rotation`` shows the source; ``rotation`` if unknown."""
     known = source.valid
     if not known.any():
@@ -94,10 +94,10 @@ def facing_matched(source: Shape, target: Shape, vertex_map: VertexMap, rotation
         there = target.vertex_normals[vertex_map.index[known]]
         normals = there, source.vertex_normals[known] @ rotation.T
     # Weighted by area: otherwise hands, where vertices are dense, would outweigh the trunk.
-    return facing_alike(target, points, seen, source.vertex_areas[known], normals)
+    return rotation_like(target, points, seen, source.vertex_areas[known], normals)
 
 
-def facing_alike(
+def rotation_like(
     shape: Shape,
     points: Points,
     seen: Points,
@@ -117,7 +117,7 @@ def facing_alike(
     correlation = (b * weights[:, None]).T @ a
     sizes = np.linalg.svd(correlation, compute_uv=False)
     if not sizes[1] > 1e-9 * sizes[0]:  # everything was matched to a line or a point
-        return facing(shape)
+        return guess_rotation(shape)
     if normals is None:
         turn = _nearest_rotation(correlation)
     else:

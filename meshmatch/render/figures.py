@@ -16,7 +16,7 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.render import surface
-from meshmatch.render.facing import facing
+from meshmatch.render.facing import guess_rotation
 from meshmatch.render.scales import CLAY, Color
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import to_linear
@@ -86,7 +86,9 @@ def build_figure(panel: Panel, up: str | None, front: str | None, turn: float, t
     colors of the wrong shape.
     """
     shape = panel.shape
-    facing_rotation = facing(shape, up, front) if panel.rotation is None else np.asarray(panel.rotation, np.float64)
+    facing_rotation = (
+        guess_rotation(shape, up, front) if panel.rotation is None else np.asarray(panel.rotation, np.float64)
+    )
     points = np.empty((0, 3)) if panel.points is None else np.asarray(panel.points, dtype=np.float64)
     a = np.radians(turn)
     rotation = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]) @ facing_rotation

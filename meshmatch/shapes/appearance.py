@@ -20,9 +20,9 @@ from typing import Literal
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints, UInts8
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr, UInts8
 from meshmatch.errors import InputError, warn
-from meshmatch.shapes.colors import INVISIBLE, light
+from meshmatch.shapes.colors import INVISIBLE, srgb_to_linear_alpha
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
@@ -70,7 +70,7 @@ class Finish:
 
     Each layer has materials and coordinates of its own, like the colors: "normal", directions in the tangent frame;
     "surface", with roughness in green and metalness in blue; "occlusion" in red; "glow", emitted light, in units of
-    `light`. A missing layer is not specified by the file.
+    `srgb_to_linear_alpha`. A missing layer is not specified by the file.
     """
 
     layers: Mapping[Layer, Appearance]
@@ -153,7 +153,7 @@ class BakedMaterial:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Appearance(Brief):
+class Appearance(ShortRepr):
     """The appearance of the faces of one shape.
 
     There is at least one material; each face has one. `uv` are the texture coordinates of each corner: u to the right,
@@ -231,7 +231,7 @@ def opaque_if_hidden(material: Material) -> Material:
 
 def vertex_colors_alone(shape: Shape) -> Appearance:
     """The appearance of a shape with vertex colors only (sRGB, as in ply, obj and off files)."""
-    colors = None if shape.colors is None else light(shape.colors)
+    colors = None if shape.colors is None else srgb_to_linear_alpha(shape.colors)
     alpha: Alpha = "blend" if colors is not None and (colors[:, 3] < 1).any() else "opaque"
     return Appearance((Material(alpha=alpha),), np.zeros(shape.F, np.int64), np.zeros((shape.F, 3, 2)), colors)
 

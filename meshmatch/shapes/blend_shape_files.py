@@ -13,7 +13,7 @@ from meshmatch.shapes.blend_shapes import BlendShapes
 from meshmatch.shapes.files import SUFFIXES, load_shape
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
-from meshmatch.shapes.input_files import existing, read_bytes, read_npz, suffix_of
+from meshmatch.shapes.input_files import check_input_file, read_bytes, read_npz, suffix_of
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_npz
 
@@ -52,7 +52,7 @@ def load_blend_shapes(given: str | Path | Sequence[str | Path], neutral: Shape) 
         if not files:
             raise InputError(f"there are no shapes in {folder}", _HINT)
     elif len(files) == 1 and files[0].suffix.lower() in (".npz", *gltf.SUFFIXES):
-        path = existing(files[0])
+        path = check_input_file(files[0])
         shapes = _from_arrays(path) if path.suffix.lower() == ".npz" else read_morphs(path, read_bytes(path))
         if shapes.moves.shape[1] != neutral.V:
             raise _other_mesh(path.name, shapes.moves.shape[1], neutral)

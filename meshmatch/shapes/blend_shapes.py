@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32
+from meshmatch.arrays import Float, Floats, Floats32, ShortRepr
 from meshmatch.geometry.triangles import same_rows, vertex_normals
 from meshmatch.shapes.shape import Shape
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class WeightClip(Brief):
+class WeightClip(ShortRepr):
     """An animation clip of blendshapes: the weights of all of them at each time.
 
     Cubic splines have three rows for each time: the incoming slopes, the weights and the outgoing slopes.
@@ -25,7 +25,7 @@ class WeightClip(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class BlendShapes(Brief):
+class BlendShapes(ShortRepr):
     """Blendshapes of one mesh, or morph targets as glTF calls them.
 
     Attributes

@@ -15,7 +15,7 @@ UNKNOWN = (0.62, 0.64, 0.67)
 """Color of what has no value."""
 INVISIBLE = 0.05
 """Alpha below this is treated as invisible."""
-_TABLE_SIZE = 1 << 14  # size of the table for `bytes_of`
+_TABLE_SIZE = 1 << 14  # size of the table for `linear_to_bytes`
 
 
 def to_linear(srgb: ArrayLike) -> Float[Floats, ...]:
@@ -30,18 +30,18 @@ def to_srgb(linear: ArrayLike) -> Float[Floats, ...]:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
-def light(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
+def srgb_to_linear_alpha(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
     """Convert sRGB colors (..., 3 or 4) to linear light; alpha is unchanged."""
     return np.concatenate([to_linear(colors[..., :3]), colors[..., 3:]], axis=-1)
 
 
-def seen(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
+def linear_to_srgb_alpha(amounts: Float[Floats, "V 4"]) -> Float[Floats, "V 4"]:
     """Convert linear colors with alpha to sRGB in 0..1; nan becomes black."""
     amounts = np.clip(np.nan_to_num(amounts), 0.0, 1.0)
     return np.concatenate([to_srgb(amounts[:, :3]), amounts[:, 3:]], axis=1)
 
 
-LINEAR_OF_BYTE: Floats32 = to_linear(np.arange(256) / 255.0).astype(np.float32)
+BYTE_TO_LINEAR: Floats32 = to_linear(np.arange(256) / 255.0).astype(np.float32)
 """(256,) linear light of each byte of an sRGB image."""
 
 # Indexed by the square root of linear light, which spreads dark values: one step of the table is below a tenth of a
@@ -49,7 +49,7 @@ LINEAR_OF_BYTE: Floats32 = to_linear(np.arange(256) / 255.0).astype(np.float32)
 _ROOT_TO_BYTE: UInts8 = np.round(255.0 * to_srgb((np.arange(_TABLE_SIZE + 1) / _TABLE_SIZE) ** 2)).astype(np.uint8)
 
 
-def bytes_of(linear: Float[Floats32, ...]) -> UInt8[UInts8, ...]:
+def linear_to_bytes(linear: Float[Floats32, ...]) -> UInt8[UInts8, ...]:
     """Convert linear light in 0..1, of any shape, to the nearest sRGB bytes; values outside are clipped."""
     root = np.sqrt(np.clip(linear, 0.0, 1.0, dtype=np.float32))
     return np.asarray(_ROOT_TO_BYTE.take((root * np.float32(_TABLE_SIZE) + np.float32(0.5)).astype(np.int32)))

@@ -22,7 +22,7 @@ _MIN_AGE = 2_000_000_000  # how old a folder's modification must be for its list
 _DRIVE = re.compile(r"[a-z]:(?=[\\/])|file:(?=/)", re.IGNORECASE)
 
 
-def beside(folder: Path, name: str, uri: bool = False) -> Path | None:
+def find_companion(folder: Path, name: str, uri: bool = False) -> Path | None:
     """Find the file that a name refers to, in a folder or below it; None if there is none.
 
     Parameters
@@ -116,7 +116,7 @@ def _equivalent_entries(folder: Path, name: str) -> list[str]:
         listing = (_entries.__wrapped__ if is_recent else _entries)(
             folder, (state.st_dev, state.st_ino, state.st_mtime_ns)
         )
-        entries = listing.get(folded(name), [])
+        entries = listing.get(canonical_name(name), [])
     except (OSError, ValueError):
         return []
     composed = unicodedata.normalize("NFC", name)
@@ -128,11 +128,11 @@ def _entries(folder: Path, state: tuple[int, int, int]) -> dict[str, list[str]]:
     """Names in a folder, grouped by their folded form; `state` identifies its content in the cache."""
     entries: dict[str, list[str]] = {}
     for entry in os.listdir(folder):
-        entries.setdefault(folded(entry), []).append(entry)
+        entries.setdefault(canonical_name(entry), []).append(entry)
     return entries
 
 
-def folded(name: str) -> str:
+def canonical_name(name: str) -> str:
     """Canonical form of a name: equal for names that differ only in case, Unicode composition, or encoding."""
     data = name.encode("utf-8", "surrogateescape")
     try:

@@ -9,25 +9,25 @@ from pathlib import Path
 import numpy as np
 
 from meshmatch import blender
-from meshmatch.arrays import Brief, Float, Floats
+from meshmatch.arrays import Float, Floats, ShortRepr
 from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats import Textured, gltf, gltf_out, obj, obj_text, off, ply, vtk
+from meshmatch.shapes.formats import TexturedMesh, gltf, gltf_write, obj, obj_text, off, ply, vtk
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_dressed import colored, dressed
-from meshmatch.shapes.formats.gltf_edit import remembering
+from meshmatch.shapes.formats.gltf_edit import record_source_mesh
+from meshmatch.shapes.formats.gltf_materials import with_material, with_vertex_colors
 from meshmatch.shapes.formats.gltf_vrm import check_character
 from meshmatch.shapes.formats.ply_edit import PlyFile
 from meshmatch.shapes.formats.vtp_edit import VtpFile
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import check_textured, files_of, image_file, tile_file
+from meshmatch.shapes.textured_files import check_textured, image_file, output_files, tile_file
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Dressed(Brief):
+class Dressed(ShortRepr):
     """A mesh with a baked material.
 
     ``file`` is the file it was read from, None for a mesh from arrays; ``uv`` are texture coordinates of each corner, v
@@ -59,16 +59,16 @@ class Dressed(Brief):
         check_character(self.file, path)
         if self.tiles:
             check_tiles(path)
-        with replace_all_on_success(files_of(path, self.material.layers, self.tiles)) as places:
+        with replace_all_on_success(output_files(path, self.material.layers, self.tiles)) as places:
             self.write(path, places)
 
     def write(self, path: Path, places: Sequence[Path]) -> None:
-        """Write the contents of `files_of` to temporary ``places``; issue a warning for what the format cannot hold."""
+        """Write the contents of `output_files` to temporary ``places``; issue a warning for what the format cannot hold."""
         if len(places) == 1:
             places[0].write_bytes(self._glb())
         else:
             self._write_obj(path, places)
-        tell_lost(self.file, path)
+        warn_about_losses(self.file, path)
 
     def _glb(self) -> bytes:
         """The mesh with its material as glb: the edited original, or a new file."""
@@ -77,20 +77,20 @@ class Dressed(Brief):
             uv, own, turn = self.uv, self.own, np.eye(3)
         else:
             uv, own, turn = self.uv[self.shape.valid_faces], False, self.turn
-        glb = gltf.understood(
-            path, data, "scene makes", lambda document: dressed(document, uv, own, self.material, turn)
+        glb = gltf.parse_document(
+            path, data, "scene makes", lambda document: with_material(document, uv, own, self.material, turn)
         )
-        return remembering(glb, self.shape)
+        return record_source_mesh(glb, self.shape)
 
     def _write_obj(self, path: Path, places: Sequence[Path]) -> None:
         shared, name = self.material, "_".join((self.material.name or path.stem).split()) or "texture"
-        files = files_of(path, shared.layers, self.tiles)
+        files = output_files(path, shared.layers, self.tiles)
         if self.file is not None and self.file.suffix.lower() == ".obj":
             text, names = self._edited_text(self.file, files[1].name, name)
             places[0].write_bytes(text)
         else:
             real = self.shape.valid_faces
-            mesh = Textured(self.shape.verts, self.shape.faces[real], self.uv[real])
+            mesh = TexturedMesh(self.shape.verts, self.shape.faces[real], self.uv[real])
             obj.write_textured(places[0], mesh, files[1].name, name)
             names = [name]
         place_of, image_names = dict(zip(files, places, strict=True)), {}
@@ -136,7 +136,7 @@ def check_tiles(path: Path) -> None:
         raise OptionError(problem, "end the name in .obj, or bring them into one (BakeOptions.tiles=False)")
 
 
-def save_textured(path: str | Path, mesh: Textured, image: Pixels) -> None:
+def save_textured(path: str | Path, mesh: TexturedMesh, image: Pixels) -> None:
     """Write a mesh with the texture `image` (H, W, 4) as glb, or as obj with an mtl and a png of the same name.
 
     Errors are those of `Dressed.save`.
@@ -158,8 +158,8 @@ def save_colored(path: Path, shape: Shape, file: Path | None, turn: Float[Floats
     if suffix in (".glb", ".vrm"):
         name, data, is_original = glb_base(file, shape)
         turned = np.eye(3) if is_original else turn
-        glb = gltf.understood(name, data, "scene makes", lambda doc: colored(doc, colors, turned))
-        path.write_bytes(remembering(glb, shape))
+        glb = gltf.parse_document(name, data, "scene makes", lambda doc: with_vertex_colors(doc, colors, turned))
+        path.write_bytes(record_source_mesh(glb, shape))
     elif suffix == ".obj" and file is not None and file.suffix.lower() == ".obj":
         path.write_bytes(obj_text.with_colors(file.name, read_bytes(file), colors))
     elif suffix == ".ply" and (as_ply := PlyFile.of(file, shape)) is not None:
@@ -179,15 +179,15 @@ def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
     """
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
         data = read_bytes(file)
-        if not gltf.understood(file, data, "scene makes", Document.draws_copies):
+        if not gltf.parse_document(file, data, "scene makes", Document.uses_instancing):
             return file, data, True
         warn(f"{file.name} draws copies of one mesh, which would have to differ: all becomes one mesh")
     name = Path(shape.name or "target").stem
     bare_shape = Shape(shape.verts, shape.faces[shape.valid_faces], name)
-    return Path(f"{name}.glb"), gltf_out.glb_of(bare_shape), False
+    return Path(f"{name}.glb"), gltf_write.glb_of(bare_shape), False
 
 
-def tell_lost(file: Path | None, path: Path, kept: bool = True) -> None:
+def warn_about_losses(file: Path | None, path: Path, kept: bool = True) -> None:
     """Warn about what an output lacks of its original file.
 
     Nothing is missing if both have the same format and all of it was ``kept``.
@@ -206,19 +206,23 @@ def tell_lost(file: Path | None, path: Path, kept: bool = True) -> None:
     elif after == ".glb" and before in gltf.SUFFIXES:
         lost = []
     else:
-        lost = beyond_triangles(file)
+        lost = content_beyond_triangles(file)
     if lost:
         listed = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
         warn(f"{path.name} does not have the {listed} of {file.name}")
 
 
-def beyond_triangles(file: Path) -> list[str]:
+def content_beyond_triangles(file: Path) -> list[str]:
     """What a file contains besides the triangles of one mesh and its material or colors, in words."""
     suffix = file.suffix.lower()
     if suffix in gltf.SUFFIXES:
-        return gltf.understood(file, read_bytes(file), "scene makes", Document.beyond_triangles)
+        return gltf.parse_document(file, read_bytes(file), "scene makes", Document.content_beyond_triangles)
     readers: dict[str, type[PlyFile | VtpFile]] = {".ply": PlyFile, ".vtp": VtpFile}
     if suffix in readers:
-        return readers[suffix].parsed(file.name, read_bytes(file)).beyond_triangles
-    describe = {".obj": obj_text.beyond_triangles, ".off": off.beyond_triangles, ".vtk": vtk.beyond_triangles}
+        return readers[suffix].parsed(file.name, read_bytes(file)).content_beyond_triangles
+    describe = {
+        ".obj": obj_text.content_beyond_triangles,
+        ".off": off.content_beyond_triangles,
+        ".vtk": vtk.content_beyond_triangles,
+    }
     return describe[suffix](file.name, read_bytes(file)) if suffix in describe else []

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
-from meshmatch.geometry.triangles import Edges, edge_keys, same_rows, squared_lengths, together, unit
+from meshmatch.geometry.triangles import Edges, component_minima, edge_keys, normalized, same_rows, squared_lengths
 
 OUTLIER_SHARE = 0.02
 """A part with less than this share of the largest part's area is an outlier. All constants here are set by hand."""
@@ -29,7 +29,7 @@ _MIN_GROUND_EXTENT, _MAX_SUNK = 1.5, 0.1
 _MAX_NEAR_GAP = 0.05  # gap up to which a small part belongs to a shape that is made of small parts
 
 
-def seams(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V"]:
+def seam_representatives(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, " V"]:
     """The vertex that represents each vertex: the first one at the same position, if both lie on open edges."""
     twin = same_rows(verts)
     is_duplicate = twin != np.arange(len(verts))
@@ -92,7 +92,7 @@ def collapse_short_edges(
     usual = np.median(squared_lengths(verts[faces[:, 1]] - verts[faces[:, 0]]))
     edges = faces[thin][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     start, end = edges[squared_lengths(verts[edges[:, 1]] - verts[edges[:, 0]]) < _DEGENERATE_LENGTH**2 * usual].T
-    return together(len(verts), start, end)
+    return component_minima(len(verts), start, end)
 
 
 def degenerate_faces(
@@ -219,7 +219,7 @@ def _find_hull(verts: Floats, faces: Ints, part: Ints) -> int | None:
     outermost = np.flatnonzero(((least <= low + slack) & (most >= high - slack)).all(axis=1))
     for each in outermost[:1].tolist():
         a, b, c = np.swapaxes(verts[faces[part == each]], 0, 1)
-        normals = unit(triangles.cross_product(b - a, c - a))
+        normals = normalized(triangles.cross_product(b - a, c - a))
         heights = [(used - corner) @ normal for corner, normal in zip(a, normals, strict=True)]
         is_inside = all(height.max() <= slack or height.min() >= -slack for height in heights)
         if is_inside and np.linalg.matrix_rank(normals, 1e-3) == 3:
@@ -304,7 +304,7 @@ def agreeing_flips(
     return side[:count] != side[first[component]], component
 
 
-def turn_faces(
+def orient_faces(
     verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], cross: Float[Floats, "F 3"], edges: Edges
 ) -> tuple[Int[Ints, "F 3"], int]:
     """Orient faces consistently and outwards; returns the faces and how many were reversed.

@@ -18,13 +18,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from meshmatch import blender
-from meshmatch.arrays import Bool, Bools, Float, Floats, TensorLike, as_numbers, off_torch
+from meshmatch.arrays import Bool, Bools, Float, Floats, TensorLike, as_numbers, to_numpy
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import as_path, plain_text, replace_on_success
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import INVISIBLE
-from meshmatch.shapes.formats import NO_FACES, Raw, gltf, gltf_out, label_maps, obj, off, plain, ply, stl, vtk, vtk_xml
-from meshmatch.shapes.input_files import LABEL_MAP_SUFFIXES, existing, read_bytes, suffix_of
+from meshmatch.shapes.formats import (
+    NO_FACES,
+    Raw,
+    gltf,
+    gltf_write,
+    label_maps,
+    obj,
+    off,
+    ply,
+    point_files,
+    stl,
+    vtk,
+    vtk_xml,
+)
+from meshmatch.shapes.input_files import LABEL_MAP_SUFFIXES, check_input_file, read_bytes, suffix_of
 from meshmatch.shapes.other_libraries import HINT, arrays_of, as_faces
 from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.shape import Shape
@@ -34,11 +47,11 @@ _FORMATS: dict[str, tuple[Callable[[Path, bytes], Raw], Callable[[Path, Shape], 
     ".obj": (obj.read, obj.write),
     ".off": (off.read, off.write),
     ".stl": (stl.read, stl.write),
-    ".glb": (gltf.read, gltf_out.write),
+    ".glb": (gltf.read, gltf_write.write),
     **dict.fromkeys(gltf.SUFFIXES[1:], (gltf.read, None)),
-    ".xyz": (plain.read_xyz, plain.write_xyz),
+    ".xyz": (point_files.read_xyz, point_files.write_xyz),
     ".pcd": (ply.read_pcd, None),
-    ".npy": (plain.read_points, plain.write_points),
+    ".npy": (point_files.read_points, point_files.write_points),
     ".vtk": (vtk.read, vtk.write_vtk),
     ".vtp": (vtk_xml.read, vtk.write_vtp),
     ".vtu": (vtk_xml.read, None),
@@ -185,7 +198,7 @@ def _unknown_name(pattern: str, named_shapes: Sequence[_NamedShape]) -> InputErr
 
 
 def _read(path: str | Path) -> tuple[Shape, Raw]:
-    path = existing(as_path(path), suffixes=SUFFIXES)
+    path = check_input_file(as_path(path), suffixes=SUFFIXES)
     suffix = suffix_of(path)
     if suffix not in _FORMATS:
         unknown = f"{path.name}: unsupported file format {suffix or '(no suffix)'}"
@@ -210,13 +223,13 @@ def _visible(name: str, colors: Floats | None) -> Floats | None:
     return np.insert(colors[:, :3], 3, 1.0, axis=1)
 
 
-def mesh_list(path: str | Path) -> list[tuple[str, int]]:
+def list_meshes(path: str | Path) -> list[tuple[str, int]]:
     """Names and numbers of vertices of a scene's meshes or a label map's labels, in the order of the vertices.
 
     The names are those that ``only`` and ``without`` of `load_shape` accept; formats without names give an empty list.
     Errors are those of `load_shape`.
     """
-    path = existing(as_path(path), suffixes=SUFFIXES)
+    path = check_input_file(as_path(path), suffixes=SUFFIXES)
     suffix = suffix_of(path)
     if suffix not in (*gltf.SUFFIXES, *LABEL_MAP_SUFFIXES):
         return []
@@ -275,13 +288,13 @@ def save_upright(path: Path, shape: Shape, turn: Float[Floats, "3 3"] | None) ->
     turned = path.suffix.lower() == ".glb" and turn is not None and not np.array_equal(turn, np.eye(3))
     if turned:
         with replace_on_success(path) as temporary:
-            temporary.write_bytes(gltf_out.glb_of(shape, turn))
+            temporary.write_bytes(gltf_write.glb_of(shape, turn))
     else:
         save_shape(path, shape)
     return turned
 
 
-def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
+def as_gltf_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
     """A shape as an editable glTF scene: a path, its content, and whether it is the shape's own glTF file.
 
     Otherwise it is a new glb with one mesh.
@@ -289,7 +302,7 @@ def as_scene(source: ShapeLike, shape: Shape) -> tuple[Path, bytes, bool]:
     file = as_path(source) if isinstance(source, str | Path) else None
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
         return file, read_bytes(file), True
-    return Path(shape.name or "target").with_suffix(".glb"), gltf_out.glb_of(shape), False
+    return Path(shape.name or "target").with_suffix(".glb"), gltf_write.glb_of(shape), False
 
 
 @runtime_checkable
@@ -346,11 +359,11 @@ def as_shape(source: ShapeLike, name: str = "") -> Shape:
 
 def as_shapes(sources: Sequence[ShapeLike]) -> list[Shape]:
     """Convert a list with `as_shape`; `InputError` also for a single shape instead of a list."""
-    check_list(sources)
+    check_is_list(sources)
     return [as_shape(source) for source in sources]
 
 
-def check_list(sources: object) -> None:
+def check_is_list(sources: object) -> None:
     """`InputError` for a single shape, or anything else that is not a list."""
     single = isinstance(sources, str | os.PathLike | Shape | HasVertices | HasPoints)
     if single or not isinstance(sources, Iterable):
@@ -362,7 +375,7 @@ def check_list(sources: object) -> None:
 def _array(values: Any) -> NDArray[Any]:
     """The values as an array; an empty one if they do not form one, such as rows of different lengths."""
     try:
-        return np.asarray(off_torch(values))
+        return np.asarray(to_numpy(values))
     except (TypeError, ValueError):
         return np.empty(0)
 

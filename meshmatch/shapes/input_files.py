@@ -31,7 +31,7 @@ LARGEST_TEXT = 1 << 29
 """Maximum size of a text file in bytes."""
 LARGEST = 1 << 30
 """Maximum uncompressed size of an array in an npz file, in bytes; a million vertices with 120 dense weights fit."""
-ROOM = 800_000_000
+MEMORY_ALLOWANCE = 800_000_000
 """Bytes of memory that a file may need beyond four times its size; the rest of a gigabyte is the program's own."""
 LABEL_MAP_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 """Volumes of labels, whose surfaces are shapes (`meshmatch.shapes.formats.label_maps`)."""
@@ -53,7 +53,7 @@ def stem_of(path: PurePath) -> str:
     return path.name[: len(path.name) - len(suffix_of(path))]
 
 
-def existing(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:
+def check_input_file(path: Path, hint: str = "", suffixes: tuple[str, ...] = ()) -> Path:
     """Check that a path is a regular, readable, nonempty file of at most `LARGEST_FILE` bytes, and return it.
 
     Otherwise `InputError`. Its hint is `hint`, or suggests the most similar name of a file with one of ``suffixes``.
@@ -93,13 +93,13 @@ def _suggest_name(path: Path, suffixes: tuple[str, ...]) -> str:
 def read_bytes(path: Path, largest: int = LARGEST_FILE) -> bytes:
     """The content of a file; text without its byte order mark (`_strip_bom`), and formats read by Blender as glb.
 
-    `InputError` as for `existing`, for a file larger than ``largest``, and if reading fails.
+    `InputError` as for `check_input_file`, for a file larger than ``largest``, and if reading fails.
     """
     try:
-        if existing(path).stat().st_size > largest:
+        if check_input_file(path).stat().st_size > largest:
             raise _text_too_large(path.name, path.stat().st_size, largest)
         if blender.is_converted(path):
-            return blender.glb_of(path)
+            return blender.convert_to_glb(path)
         data = path.read_bytes()
         return _strip_bom(path.name, data) if path.suffix.lower() in _MAYBE_TEXT else data
     except OSError as error:
@@ -141,7 +141,7 @@ def _decode(name: str, data: bytes) -> str:
         return text
 
 
-def check_text(name: str, data: bytes) -> None:
+def check_text_size(name: str, data: bytes) -> None:
     """`InputError` for a text that is too large, or has too many lines or words for the memory."""
     if len(data) > LARGEST_TEXT:
         raise _text_too_large(name, len(data), LARGEST_TEXT)
@@ -156,10 +156,10 @@ def _text_too_large(name: str, size: int, largest: int) -> InputError:
 
 def read_json(path: Path) -> Any:
     """The value of a JSON file; `InputError` if it would take too much memory (`check_memory`)."""
-    return json_of(path.name, read_bytes(path, largest=LARGEST_TEXT // 2))
+    return parse_json(path.name, read_bytes(path, largest=LARGEST_TEXT // 2))
 
 
-def json_of(name: str, data: bytes) -> Any:
+def parse_json(name: str, data: bytes) -> Any:
     """The value of a JSON text; `ValueError` if it is not JSON, `InputError` if it would take too much memory."""
     check_memory(name, len(data), 100 * sum(map(data.count, b",[")) + 250 * data.count(b"{"))
     try:
@@ -170,7 +170,7 @@ def json_of(name: str, data: bytes) -> Any:
 
 def check_memory(name: str, size: int, need: int) -> None:
     """`InputError` if a file of ``size`` bytes would ``need`` more memory than four times its size plus a gigabyte."""
-    if need > 4 * size + ROOM:
+    if need > 4 * size + MEMORY_ALLOWANCE:
         large = f"{name} promises too much: of {size / 1e6:,.0f} MB it would make {need / 1e9:.1f} GB"
         raise InputError(large, "make it smaller, or save it uncompressed in a binary format")
 

@@ -31,7 +31,7 @@ from meshmatch.shapes.input_files import (
     read_text,
     suffix_of,
 )
-from meshmatch.shapes.tables import DECIMAL_COMMA, is_missing, is_number, number, read_table
+from meshmatch.shapes.tables import DECIMAL_COMMA, is_missing, is_number, parse_number, read_table
 
 Space = Literal["", "LPS", "RAS"]
 Kind = Literal["vertex", "face", "position", "missing"]
@@ -101,7 +101,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
         The file has no landmarks, or some that cannot be read.
     """
     reader = LANDMARK_READERS[path.suffix.lower()]
-    records = reader(path, Path(shape.removesuffix(".gz")).stem) if reader in READERS_OF_SEVERAL else reader(path)
+    records = reader(path, Path(shape.removesuffix(".gz")).stem) if reader in SPECIMEN_READERS else reader(path)
     if not records:
         raise InputError(f"{path.name} holds no landmark")
     if len(spaces := {_SPACES.get(str(record.get("space")), "") for record in records}) > 1:
@@ -119,7 +119,7 @@ def read_landmark_file(path: Path, shape: str = "", space: Space = "") -> Landma
 
 def _parse_place(record: Record, number: int, turned: bool) -> Place:
     raw_name = record.get("name")
-    name = one_line(str(number if raw_name in (None, "") else raw_name))
+    name = one_line_name(str(number if raw_name in (None, "") else raw_name))
     face, weights, vertex = record.get("face"), record.get("barycentric"), record.get("vertex")
     if face is not None and face != -1 and weights is not None:
         return Place(name, "face", (_parse_index(face, name), _parse_three(weights, name)))
@@ -135,7 +135,7 @@ def _parse_place(record: Record, number: int, turned: bool) -> Place:
     return Place(name, "missing", " is vertex -1" if vertex == -1 else " has no vertex and no position")
 
 
-def one_line(name: str) -> str:
+def one_line_name(name: str) -> str:
     """A name as files can hold it: on one line, without unprintable characters, and with single spaces."""
     words = "".join(c if c.isprintable() else " " for c in name)
     return plain_text(" ".join(words.split()))
@@ -151,7 +151,9 @@ def _parse_three(values: Any, name: str) -> list[float]:
     if not isinstance(values, list) or len(values) != 3:
         comma = DECIMAL_COMMA if isinstance(values, list) and len(values) == 6 else ""
         raise InputError(f"landmark {name}: three numbers are needed, not {str(values)[:40]}", comma)
-    return [number(value) if isinstance(value, str) else float("nan" if value is None else value) for value in values]
+    return [
+        parse_number(value) if isinstance(value, str) else float("nan" if value is None else value) for value in values
+    ]
 
 
 def _read_npy(path: Path) -> list[Record]:
@@ -203,11 +205,11 @@ def _read_table(path: Path, shape: str) -> list[Record]:
         rows = [row for row in rows if row[specimen_column] == chosen]
     name_column = next((name for name in _NAME_COLUMNS if name in head), "")
     numeric = [k for k, name in enumerate(head) if name in ("x", "y", "z", "w0", "w1", "w2")]
-    table.check_marks([[row[k] for k in numeric] for row in rows])
+    table.check_decimal_marks([[row[k] for k in numeric] for row in rows])
     records = []
     for row in rows:
         cell = dict(zip(head, row, strict=True))
-        value = {name: number(cell[name]) for name in cell if any(name in place for place in _PLACE_COLUMNS)}
+        value = {name: parse_number(cell[name]) for name in cell if any(name in place for place in _PLACE_COLUMNS)}
         record: Record = {"name": cell.get(name_column)}
         # Use the most precise of a row: a face with weights, then a vertex, then a position.
         if {"face", "w0", "w1", "w2"} <= set(value) and value["face"] >= 0:
@@ -300,7 +302,7 @@ def _read_fcsv(path: Path) -> list[Record]:
                 f"landmark {len(records)} has {len(row)} cells, but there are {len(head)} columns", DECIMAL_COMMA
             )
         name = cell.get("label") or cell.get("id")
-        position = [number(cell.get(axis, "")) for axis in "xyz"]
+        position = [parse_number(cell.get(axis, "")) for axis in "xyz"]
         records.append({"name": name, "position": position, "space": _SPACES[space[1].upper()] if space else ""})
     return records
 
@@ -318,7 +320,7 @@ def _read_pts(path: Path) -> list[Record]:
             is_planar = len(words) == 2 and all(map(is_number, words))
             problem = "its points lie in a plane" if is_planar else f"{line.strip()[:40]!r} is not a point"
             raise InputError(problem, "a point a line: x y z, or name x y z")
-        position = [number(word) for word in words[-3:]]
+        position = [parse_number(word) for word in words[-3:]]
         missing = all(abs(each) == _ABSENT for each in position)
         name = words[0] if len(words) == 4 else None
         records.append({"name": name, "position": None if missing else position})
@@ -347,7 +349,7 @@ def _read_tps(path: Path, shape: str) -> list[Record]:
     if not specimens:
         return []
     points, meta = specimens[_find_index([{meta.get("ID", ""), meta.get("IMAGE", "")} for _, meta in specimens], shape)]
-    scale = number(meta.get("SCALE", "1"))
+    scale = parse_number(meta.get("SCALE", "1"))
     return [{"position": [scale * each for each in point]} for point in points]
 
 
@@ -416,7 +418,7 @@ def _read_pp(path: Path) -> list[Record]:
     records: list[Record] = []
     for point in root.iter("point"):
         is_placed = point.get("active", "1") != "0"  # otherwise it is an unplaced point of a template
-        position = [number(point.get(axis, "")) for axis in "xyz"] if is_placed else None
+        position = [parse_number(point.get(axis, "")) for axis in "xyz"] if is_placed else None
         records.append({"name": point.get("name"), "position": position})
     return records
 
@@ -433,7 +435,7 @@ LANDMARK_READERS: Mapping[str, Callable[..., list[Record]]] = {
     ".npy": _read_npy,
 }
 
-READERS_OF_SEVERAL = (_read_tps, _read_table)  # readers that also take the name of a specimen
+SPECIMEN_READERS = (_read_tps, _read_table)  # readers that also take the name of a specimen
 
 
 def tps_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
@@ -441,12 +443,12 @@ def tps_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
     for name, points in specimens.items():
         yield f"LM3={len(points)}"
         yield from map(_format_three, points.tolist())
-        yield f"ID={one_line(name)}"
+        yield f"ID={one_line_name(name)}"
 
 
 def morphologika_lines(specimens: Mapping[str, Floats]) -> Iterable[str]:
     """Lines of a Morphologika file from the landmark positions (L, 3) of each specimen; nan is written as NA."""
-    names = [one_line(name) for name in specimens]
+    names = [one_line_name(name) for name in specimens]
     length = len(next(iter(specimens.values())))
     yield from ("[individuals]", str(len(names)), "[landmarks]", str(length), "[dimensions]", "3", "[names]", *names)
     yield "[rawpoints]"

@@ -13,9 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshmatch.arrays import Bools, Float, Floats, Int, Ints, off_torch
+from meshmatch.arrays import Bools, Float, Floats, Int, Ints, to_numpy
 from meshmatch.errors import InputError, warn
-from meshmatch.shapes.formats import colors_of_faces, fan, joined_colors, painted, runs
+from meshmatch.shapes.formats import (
+    concatenate_colors,
+    concatenated_ranges,
+    fan,
+    rgba_from_channels,
+    vertex_colors_from_faces,
+)
 from meshmatch.shapes.formats.polygons import triangles_of
 
 HINT = "pass a path, a Shape, (vertices, faces), an (N, 3) array, or an object with .vertices and .faces"
@@ -123,7 +129,7 @@ def _get_value(source: Any, *names: str) -> Any:
 
 def _array(values: Any, label: str) -> np.ndarray:
     try:
-        return np.asarray(off_torch(values))
+        return np.asarray(to_numpy(values))
     except (TypeError, ValueError) as error:
         raise InputError(f"{label}: not an array of numbers ({error})", HINT) from error
 
@@ -183,7 +189,7 @@ def _flat_polygons(values: np.ndarray, label: str, chosen: Bools | None = None) 
         if len(chosen) != len(starts):
             raise InputError(f"{label} has {len(starts)} cells and {len(chosen)} types of cells", HINT)
         starts, sizes = starts[chosen], sizes[chosen]
-    return _Polygons(values[runs(starts, sizes)].astype(np.int64), sizes)
+    return _Polygons(values[concatenated_ranges(starts, sizes)].astype(np.int64), sizes)
 
 
 def _faces(source: Any, label: str) -> Any:
@@ -283,7 +289,7 @@ def _scene(scene: Any, label: str) -> Arrays:
         start += len(points)
     if not verts:
         raise InputError(f"{label} is a scene without meshes", HINT)
-    joined = joined_colors(colors, [len(own) for own in verts])
+    joined = concatenate_colors(colors, [len(own) for own in verts])
     return Arrays(np.concatenate(verts), np.concatenate(faces) if faces else None, joined)
 
 
@@ -303,10 +309,10 @@ def _colors(source: Any, label: str) -> Float[Floats, "V 4"] | None:
     if getattr(visual, "kind", None) == "face":
         warn(f"{label} has colors of faces: each vertex gets the mean of those around it")
         corner_colors = np.repeat(np.asarray(visual.face_colors, np.float64) / 255.0, 3, axis=0)
-        return colors_of_faces(len(source.vertices), np.asarray(source.faces).ravel(), corner_colors)
+        return vertex_colors_from_faces(len(source.vertices), np.asarray(source.faces).ravel(), corner_colors)
     if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors):  # trimesh clouds have none
         return np.asarray(visual.vertex_colors, np.float64) / 255.0
     for has, name in (("has_vertex_colors", "vertex_colors"), ("has_colors", "colors")):
         if callable(getattr(source, has, None)) and getattr(source, has)():
-            return painted(np.asarray(getattr(source, name), np.float64))
+            return rgba_from_channels(np.asarray(getattr(source, name), np.float64))
     return None

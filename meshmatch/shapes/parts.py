@@ -14,7 +14,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry import triangles
-from meshmatch.shapes.faces import degenerate_faces, seams
+from meshmatch.shapes.faces import degenerate_faces, seam_representatives
 from meshmatch.shapes.shape import Shape
 
 # All constants were set by hand; lengths are in units of sqrt(area) of the reference part, see `_reference_part`.
@@ -67,7 +67,7 @@ class Parts:
             return _parts_of_cloud(cls, shape)
         usable = np.flatnonzero(shape.valid_faces)
         corners = shape.faces[usable]
-        twin = seams(shape.verts, corners)
+        twin = seam_representatives(shape.verts, corners)
         vectors = shape.face_vectors[usable]
         has_area = ~degenerate_faces(shape.verts, twin[corners], vectors, shape.diagonal)
         usable, corners = usable[has_area], corners[has_area]
@@ -141,7 +141,7 @@ def leave_out(shape: Shape, numbers: Sequence[int]) -> Shape:
     return without_parts(shape, Parts.of(shape, bases=True), numbers) if numbers else shape
 
 
-def tries(parts: Parts) -> list[frozenset[int]]:
+def candidate_sets(parts: Parts) -> list[frozenset[int]]:
     """Sets of parts that may be an object next to something else, the likelier ones first; at most `_MAX_TRIES`.
 
     Touching parts, such as a body and its clothes, stay together: groups are formed without all large simple parts
@@ -173,7 +173,7 @@ def tries(parts: Parts) -> list[frozenset[int]]:
     return [each for each in dict.fromkeys(candidates) if each != everything][:_MAX_TRIES]
 
 
-def apart(parts: Parts, one: frozenset[int], other: frozenset[int]) -> bool:
+def are_separate(parts: Parts, one: frozenset[int], other: frozenset[int]) -> bool:
     """Whether two sets of parts are next to each other: neither is around the other, as a coat is."""
     if one & other:
         return False

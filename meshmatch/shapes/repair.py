@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshmatch.arrays import Bool, Bools, Brief, Int, Ints
+from meshmatch.arrays import Bool, Bools, Int, Ints, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import edges_of, same_rows
 from meshmatch.shapes.cloud import outlier_points
@@ -23,8 +23,8 @@ from meshmatch.shapes.faces import (
     duplicate_faces,
     find_outlier_parts,
     find_spikes,
-    seams,
-    turn_faces,
+    orient_faces,
+    seam_representatives,
 )
 from meshmatch.shapes.shape import Shape
 
@@ -34,7 +34,7 @@ NOT_TRUSTED = "left out, as was asked for (weight 0)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Repaired(Brief):
+class Repaired(ShortRepr):
     """A repaired shape, and its relation to the original.
 
     All vertices of `shape` are valid and, in a mesh, used by a face; they have not moved, unless noise was smoothed.
@@ -105,7 +105,7 @@ def repair(shape: Shape) -> Repaired:
     return (_repair_cloud if shape.is_cloud else _repair_mesh)(shape, valid, notes)
 
 
-def turned_outwards(shape: Shape) -> Shape:
+def oriented_outwards(shape: Shape) -> Shape:
     """The shape with faces oriented as by `repair`, and no other change.
 
     Nodes of negative scale, and some scans, are inside out.
@@ -113,8 +113,8 @@ def turned_outwards(shape: Shape) -> Shape:
     has_area = np.flatnonzero(shape.face_areas > 0)
     if not len(has_area):
         return shape
-    faces = seams(shape.verts, shape.faces)[shape.faces[has_area]]
-    oriented, n_turned = turn_faces(shape.verts, faces, shape.face_vectors[has_area], edges_of(faces))
+    faces = seam_representatives(shape.verts, shape.faces)[shape.faces[has_area]]
+    oriented, n_turned = orient_faces(shape.verts, faces, shape.face_vectors[has_area], edges_of(faces))
     if not n_turned:
         return shape
     flip = has_area[(oriented != faces).any(axis=1)]
@@ -145,7 +145,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
         _add_note(notes, int(ignored.sum()), "face", NOT_TRUSTED)
         drop |= ignored
     faces, cross, original_face = _drop(drop, shape.faces, shape.face_vectors, np.arange(shape.F))
-    twin = np.where(valid, seams(shape.verts, faces), np.arange(shape.V))
+    twin = np.where(valid, seam_representatives(shape.verts, faces), np.arange(shape.V))
     n_doubles = int((twin != np.arange(shape.V)).sum())
     if n_doubles:
         _add_note(notes, n_doubles, "vertex", "merged with another at the same position")
@@ -177,7 +177,7 @@ def _repair_mesh(shape: Shape, valid: Bools, notes: list[str]) -> Repaired:
     kept, touched = (np.bincount(each.ravel(), minlength=shape.V) > 0 for each in (faces, shape.faces))
     _add_note(notes, int((valid & ~touched).sum()), "vertex", "that no face uses dropped")
     edges = shape.edges if np.array_equal(faces, shape.faces) else edges_of(faces)
-    faces, n_turned = turn_faces(shape.verts, faces, cross, edges)
+    faces, n_turned = orient_faces(shape.verts, faces, cross, edges)
     if n_turned == len(faces):
         notes.append("turned all faces: the shape was inside out")
     else:

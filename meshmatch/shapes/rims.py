@@ -13,7 +13,7 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.triangles import edge_lengths
 from meshmatch.shapes.shape import Shape
 
-RIM = 0.3  # minimum length of a rim, in units of sqrt(area); cracks of a mesh are shorter
+MIN_RIM_LENGTH = 0.3  # minimum length of a rim, in units of sqrt(area); cracks of a mesh are shorter
 # minimum length of all rims of a sheet: no flat shape has less than a disk's 3.54; a broken bone has 2.6
 MIN_SHEET_RIMS = 3.5
 
@@ -31,7 +31,7 @@ def is_sheet(shape: Shape) -> bool:
     """Whether a shape is an open sheet, such as a leaf: its rims are natural ends, unlike those of a cut shape."""
     if shape.is_cloud:
         return False
-    ends = shape.edges.open[rim_lengths(shape)[shape.edges.open[:, 0]] > RIM]
+    ends = shape.edges.open[rim_lengths(shape)[shape.edges.open[:, 0]] > MIN_RIM_LENGTH]
     return bool(edge_lengths(shape.verts, ends).sum() > MIN_SHEET_RIMS * np.sqrt(shape.area))
 
 
@@ -39,13 +39,13 @@ def rim_corners(shape: Shape) -> Int[Ints, "E 3"]:
     """Both ends of each edge of a rim, and the third corner of its triangle; shorter boundaries (cracks) are ignored."""
     faces = np.asarray(shape.faces)
     corners = np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
-    corners = corners[(rim_lengths(shape) > RIM)[corners[:, :2]].all(axis=1)]
+    corners = corners[(rim_lengths(shape) > MIN_RIM_LENGTH)[corners[:, :2]].all(axis=1)]
     keys = np.sort(corners[:, :2], axis=1) @ np.array([shape.V, 1])
     first, faces_at = np.unique(keys, return_index=True, return_counts=True)[1:]
     return np.asarray(corners[first[faces_at == 1]])
 
 
-def at_rim(
+def rim_edges(
     verts: Float[Floats, "V 3"], corners: Int[Ints, "E 3"]
 ) -> tuple[Float[Floats, " E"], Float[Floats, "E 3"], Float[Floats, "E 3"]]:
     """Length of each rim edge, and unit vectors that point out of the surface there, and along the edge."""
@@ -68,7 +68,7 @@ class RimPoints:
     def of(cls, shape: Shape, step: float) -> RimPoints:
         """Points at most ``step`` apart (in units of sqrt(area)); none for a shape without a rim."""
         corners = rim_corners(shape)
-        length, outward, along = at_rim(shape.verts, corners)
+        length, outward, along = rim_edges(shape.verts, corners)
         count = np.ceil(np.maximum(length / (step * np.sqrt(shape.area)), 1.0)).astype(np.int64)
         edge = np.repeat(np.arange(len(corners)), count)
         share = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[edge]

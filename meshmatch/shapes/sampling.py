@@ -12,7 +12,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import dot, interpolate, triangle_vectors, unit
+from meshmatch.geometry.triangles import dot, interpolate, normalized, triangle_vectors
 from meshmatch.shapes.shape import Shape
 
 _N_NEIGHBOURS = 16
@@ -60,7 +60,9 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     points = interpolate(shape.verts, corners, weights)
     vertex = corners[np.arange(P), weights.argmax(axis=1)]
     trust = None if shape.weights is None else (weights * shape.weights[corners]).sum(axis=1)
-    return Samples(points, unit(shape.face_vectors[face]), True, trust, face=face, barycentric=weights, vertex=vertex)
+    return Samples(
+        points, normalized(shape.face_vectors[face]), True, trust, face=face, barycentric=weights, vertex=vertex
+    )
 
 
 def farthest_points(points: Float[Floats, "N D"], K: int) -> Int[Ints, " K"]:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, Pickled, as_read_only, frozen, off_torch
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, PickledFields, as_read_only, set_read_only, to_numpy
 from meshmatch.errors import InputError
 from meshmatch.geometry import triangles
-from meshmatch.geometry.triangles import average_normals, share_areas, squared_lengths, triangle_vectors
+from meshmatch.geometry.triangles import areas_to_vertices, average_normals, squared_lengths, triangle_vectors
 from meshmatch.shapes.cloud import estimate_normals, local_areas, roughness
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ LARGEST = 1e60
 
 
 @dataclass(frozen=True, eq=False)
-class Shape(Pickled):
+class Shape(PickledFields):
     """A triangle mesh, or a point cloud if it has no faces. It is validated on construction; its arrays are read-only.
 
     Attributes
@@ -78,7 +78,7 @@ class Shape(Pickled):
     def __post_init__(self) -> None:
         label = self.name or "the shape"
         verts = as_read_only(self.verts, np.float64, label)
-        given = np.asarray([] if self.faces is None else off_torch(self.faces))
+        given = np.asarray([] if self.faces is None else to_numpy(self.faces))
         if given.size and given.dtype.kind not in "iu":
             raise InputError(f"{label}: faces must be integers, not {given.dtype}")
         faces = as_read_only(given if given.size else np.empty((0, 3)), np.int64, label)
@@ -189,7 +189,7 @@ class Shape(Pickled):
     def on_surface(self) -> Bool[Bools, " V"]:
         """(V,) whether a vertex belongs to a valid face; without such faces, as in a cloud, whether it has a position."""
         used = np.bincount(self.faces[self.valid_faces].ravel(), minlength=self.V) > 0
-        return frozen(used if used.any() else self.valid)
+        return set_read_only(used if used.any() else self.valid)
 
     @cached_property
     def face_vectors(self) -> Floats:
@@ -202,7 +202,7 @@ class Shape(Pickled):
     @cached_property
     def face_areas(self) -> Floats:
         """(F,) areas, in squared units of the file."""
-        return frozen(0.5 * np.sqrt(squared_lengths(self.face_vectors)))
+        return set_read_only(0.5 * np.sqrt(squared_lengths(self.face_vectors)))
 
     @property
     def _valid_verts(self) -> Floats:
@@ -211,18 +211,18 @@ class Shape(Pickled):
     def _estimate(self, estimate: Callable[[Floats], Floats]) -> Floats:
         """Estimates for the points of a cloud; zeros for invalid ones."""
         if self.invalid is None:
-            return frozen(estimate(self.verts))
+            return set_read_only(estimate(self.verts))
         estimates = estimate(self._valid_verts)
         result = np.zeros((self.V, *estimates.shape[1:]))
         result[~self.invalid] = estimates
-        return frozen(result)
+        return set_read_only(result)
 
     @cached_property
     def vertex_areas(self) -> Floats:
         """(V,) area of each vertex: a third of that of its faces; estimated for a cloud."""
         if self.is_cloud:
             return self._estimate(local_areas)
-        return frozen(share_areas(self.face_areas, self.faces, self.V))
+        return set_read_only(areas_to_vertices(self.face_areas, self.faces, self.V))
 
     @cached_property
     def vertex_normals(self) -> Floats:
@@ -232,7 +232,7 @@ class Shape(Pickled):
         """
         if self.is_cloud:
             return self._estimate(estimate_normals)
-        return frozen(average_normals(self.face_vectors, self.faces, self.V))
+        return set_read_only(average_normals(self.face_vectors, self.faces, self.V))
 
     @cached_property
     def edges(self) -> triangles.Edges:
@@ -242,14 +242,14 @@ class Shape(Pickled):
     @cached_property
     def face_parts(self) -> Ints:
         """(F,) number of the connected part of each face; faces that share a vertex are connected."""
-        return frozen(triangles.face_parts(self.faces, self.V))
+        return set_read_only(triangles.face_parts(self.faces, self.V))
 
     @cached_property
     def vertex_parts(self) -> Ints:
         """(V,) number of the connected part of each vertex; -1 without a face."""
         part = np.full(self.V, -1, np.int64)
         part[self.faces] = self.face_parts[:, None]
-        return frozen(part)
+        return set_read_only(part)
 
     @cached_property
     def area(self) -> float:
@@ -265,7 +265,7 @@ class Shape(Pickled):
     def bounds(self) -> Floats:
         """(2, 3) lowest and highest corner of the bounding box of the surface, or of a cloud's points."""
         verts = self.verts[self.on_surface] if self.on_surface.any() else self.verts
-        return frozen(np.stack([verts.min(axis=0), verts.max(axis=0)]))
+        return set_read_only(np.stack([verts.min(axis=0), verts.max(axis=0)]))
 
     @property
     def diagonal(self) -> float:

@@ -26,7 +26,7 @@ from meshmatch import blender
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.outputs import as_path, plain_text
-from meshmatch.shapes.input_files import check_memory, existing, read_text
+from meshmatch.shapes.input_files import check_input_file, check_memory, read_text
 
 T = TypeVar("T")
 # Exceptions that damaged files raise in readers of the standard library and NumPy.
@@ -61,7 +61,7 @@ def is_missing(cell: str) -> bool:
     return cell.strip().lower() in _MISSING
 
 
-def number(cell: str) -> float:
+def parse_number(cell: str) -> float:
     """Parse a cell as a number with a decimal point or comma; nan if it is missing. `ValueError` if it is not a number."""
     word = cell.strip()
     if _NUMBER.fullmatch(word):
@@ -76,13 +76,13 @@ def number(cell: str) -> float:
 def is_number(cell: str) -> bool:
     """Whether a cell is a number, or missing."""
     try:
-        number(cell)
+        parse_number(cell)
     except ValueError:
         return False
     return True
 
 
-def whole(values: ArrayLike) -> Ints:
+def as_whole_numbers(values: ArrayLike) -> Ints:
     """Convert whole numbers, also if written as 10.0 or 1.000e+01, to integers; `ValueError` for other values."""
     array = np.asarray(values)
     if array.dtype.kind in "iu" and array.size and array.max() > np.iinfo(np.int64).max:
@@ -184,14 +184,14 @@ class Table:
         is_plain = self.text.isascii() and "_" not in self.text  # Python accepts other digits, and 1_000
         for k, row in enumerate(rows):
             try:
-                table[k] = _parse_floats(row) if is_plain else [number(cell) for cell in row]
+                table[k] = _parse_floats(row) if is_plain else [parse_number(cell) for cell in row]
             except ValueError as error:
                 hint = DECIMAL_COMMA if any("," in cell and not is_number(cell) for cell in row) else ""
                 raise InputError(f"line {self._line_number(k + is_header)}: {error}", hint) from error
-        self.check_marks(rows)
+        self.check_decimal_marks(rows)
         return names or self._names_from_comment(table.shape[1]), table
 
-    def check_marks(self, rows: list[list[str]]) -> None:
+    def check_decimal_marks(self, rows: list[list[str]]) -> None:
         """`InputError` if numbers have both decimal points and decimal commas, or commas that may group thousands."""
         if self.separator != "," and not ("," in self.text and "." in self.text):
             return
@@ -204,7 +204,7 @@ class Table:
             problem = f"is the comma in {cells[0]} a decimal comma, or does it divide thousands?"
             raise InputError(problem, "write numbers without commas")
 
-    def check_no_doubt(self) -> None:
+    def check_unambiguous(self) -> None:
         """`InputError` if lines may be one column with decimal commas or several of whole numbers."""
         if self.is_doubtful:
             line = next(line for line in _lines(self.text) if line.strip()).strip()
@@ -338,7 +338,7 @@ def _parse_floats(row: list[str]) -> list[float]:
     try:
         return list(map(float, row))
     except ValueError:
-        return [number(cell) for cell in row]
+        return [parse_number(cell) for cell in row]
 
 
 def _has_decimal_commas(row: list[str]) -> bool:
@@ -400,7 +400,7 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
     `InputError` if there is none, or the file is missing, empty or damaged. Messages begin with the file's name. Errors
     of a reader keep their class and message, and get `hint` if they have none.
     """
-    path = existing(as_path(path), hint)
+    path = check_input_file(as_path(path), hint)
     suffix = path.suffix.lower()
     if suffix not in readers:
         raise InputError(f"{path.name}: {what} are not read from '{suffix}' files", f"choose {', '.join(readers)}")
@@ -417,7 +417,9 @@ def read_by_suffix(path: str | Path, readers: Mapping[str, Callable[[Path], T]],
 def is_numbered(numbers: ArrayLike | Sequence[str]) -> bool:
     """Whether the rows are numbered 0, 1, 2, ...; ``numbers`` are numbers, or cells of a table."""
     try:
-        rows = np.array([number(each) if isinstance(each, str) else each for each in np.asarray(numbers).tolist()])
+        rows = np.array(
+            [parse_number(each) if isinstance(each, str) else each for each in np.asarray(numbers).tolist()]
+        )
     except ValueError:
         return False
     return np.array_equal(rows, np.arange(len(rows)))

@@ -13,21 +13,21 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader, Layer
-from meshmatch.shapes.formats import gltf, gltf_attributes, gltf_finish, obj_look, ply_look
+from meshmatch.shapes.formats import gltf, gltf_attributes, gltf_layers, obj_appearance, ply_appearance
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
 
 TEXTURED_SUFFIXES = (".glb", ".obj", ".vrm")
-_FINISHES = dict.fromkeys(gltf.SUFFIXES, gltf_finish.read_finish) | {".obj": obj_look.read_finish}
+_FINISHES = dict.fromkeys(gltf.SUFFIXES, gltf_layers.read_finish) | {".obj": obj_appearance.read_finish}
 _LAYER_IMAGES: dict[Layer, tuple[str, ...]] = {
     "normal": ("normal",),
     "surface": ("roughness", "metal"),
     "glow": ("emission",),
 }
 _READERS = {  # readers of appearances, and of texture coordinates alone
-    **dict.fromkeys(gltf.SUFFIXES, (gltf_attributes.read_look, gltf_attributes.read_coordinates)),
-    ".obj": (obj_look.read_look, obj_look.read_coordinates),
-    ".ply": (ply_look.read_look, ply_look.read_coordinates),
+    **dict.fromkeys(gltf.SUFFIXES, (gltf_attributes.read_appearance, gltf_attributes.read_coordinates)),
+    ".obj": (obj_appearance.read_appearance, obj_appearance.read_coordinates),
+    ".ply": (ply_appearance.read_appearance, ply_appearance.read_coordinates),
 }
 
 
@@ -87,7 +87,7 @@ def load_coordinates(path: str | Path, shape: Shape) -> Float[Floats, "F 3 2"] |
     return coordinates if shape.F else None
 
 
-def files_of(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | str] = ()) -> list[Path]:
+def output_files(path: Path, layers: Collection[Layer] = (), tiles: Iterable[int | str] = ()) -> list[Path]:
     """The files of an output: an obj has an mtl, and images for each map of these layers and each tile (UDIM)."""
     if path.suffix.lower() != ".obj":
         return [path]

@@ -14,7 +14,7 @@ import numpy as np
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.shapes.input_files import read_npy
-from meshmatch.shapes.tables import DECIMAL_COMMA, read_by_suffix, read_table, whole
+from meshmatch.shapes.tables import DECIMAL_COMMA, as_whole_numbers, read_by_suffix, read_table
 
 _PAIRS = "one pair a line of text (or .npy): a vertex of the source, then a vertex of the target, counted from 0"
 _POINTS = "one vertex a line of text (or .npy), counted from 0"
@@ -44,7 +44,7 @@ def _read_vertices(path: Path, columns: tuple[int, ...], hint: str, missing: boo
 
     def numbers(path: Path) -> Ints:
         values = read(path)
-        return whole(np.nan_to_num(values, nan=-1.0) if missing and values.dtype.kind == "f" else values)
+        return as_whole_numbers(np.nan_to_num(values, nan=-1.0) if missing and values.dtype.kind == "f" else values)
 
     rows = read_by_suffix(path, {suffix: numbers}, "vertices", hint)
     if rows.ndim == 1 and 1 in columns:

@@ -23,8 +23,8 @@ from meshmatch.derived import derived
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.geometry.kernels import poorly_supported
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.decimate import Quality, decimate
-from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.sampling import Samples, farthest_points, sample_surface, triangulate_cloud
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
@@ -133,7 +133,7 @@ def make_template(
         raise TemplateError(f"{shape.name} has a label below 0: {parts.min()}", "count parts from 0")
     in_core = np.ones(shape.V, bool) if core is None else np.isin(np.arange(shape.V), core)
     dense = small if shape.is_cloud else Shape(frame.apply(shape.verts), shape.faces, name)
-    placement = lay_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
+    placement = place_nodes(small, config, None if labels is None else parts[keep], noisy=shape.is_cloud)
     names = tuple(label_names) or tuple(f"part {n}" for n in range(int(parts.max()) + 1))
     core = np.flatnonzero(in_core[keep])
     return Template(name, small, dense, placement.nodes, placement.radius, parts[keep], names, core)
@@ -152,11 +152,11 @@ class NodePlacement:
 def choose_nodes(
     shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
 ) -> Float[Floats, "K 3"]:
-    """Return the nodes of `lay_nodes`."""
-    return lay_nodes(shape, config, labels, noisy).nodes
+    """Return the nodes of `place_nodes`."""
+    return place_nodes(shape, config, labels, noisy).nodes
 
 
-def lay_nodes(
+def place_nodes(
     shape: Shape, config: NodeConfig, labels: Int[Ints, " V"] | None = None, noisy: bool = False
 ) -> NodePlacement:
     """Place nodes such that every vertex of a mesh in the template frame has four non-coplanar ones in reach.

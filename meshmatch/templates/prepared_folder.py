@@ -15,19 +15,19 @@ from typing import Any, TypeVar
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints, ShortRepr
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.outputs import as_path
 from meshmatch.progress import Progress
+from meshmatch.shapes.alignment import ALIGNS, Align, align, alignment_residual
 from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.landmark_files import LANDMARK_READERS, Space, read_landmark_file
-from meshmatch.shapes.normalise import ALIGNS, Align, align, residual
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.tables import read_by_suffix
-from meshmatch.templates.sides import mirror_image
+from meshmatch.templates.mirror_images import mirror_image
 from meshmatch.templates.template import SCALES, Scale, Template, template_radius, template_samples, unit_frame
 
 T = TypeVar("T")
@@ -56,7 +56,7 @@ class ShapeSamples:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RegisteredShapes(Brief):
+class RegisteredShapes(ShortRepr):
     """N shapes on the vertices of a template, in its orientation, from fits with or without a trained model.
 
     ``orientation`` is the range of rotations of fits without a model, and ``mirror`` whether some were mirrored; both are
@@ -141,7 +141,7 @@ def medoid(shapes: Sequence[Repaired], how: Align, scale: Scale, seed: int, eith
         aligned.append(part)
     distance = np.zeros((len(aligned), len(aligned)))
     for i, j in combinations(range(len(aligned)), 2):
-        distance[i, j] = distance[j, i] = residual(aligned[j], aligned[i])
+        distance[i, j] = distance[j, i] = alignment_residual(aligned[j], aligned[i])
     return pool[int(distance.sum(1).argmin())]
 
 
@@ -236,7 +236,7 @@ def read_known_points(file: Path, clean: Repaired, space: Space = "") -> KnownPo
     return KnownPoints(points, tuple(place.name for place in found.places) if found.has_names else ())
 
 
-def in_one_order(known: Sequence[KnownPoints | None]) -> list[Float[Floats, "L 3"] | None]:
+def sort_by_name(known: Sequence[KnownPoints | None]) -> list[Float[Floats, "L 3"] | None]:
     """Sort the landmarks of shapes by name, in the order of first occurrence, NaN where missing.
 
     Unless all shapes with landmarks have unique names and share some, landmarks are returned in the order of their files.
@@ -327,7 +327,7 @@ def is_registered(folder: str | Path) -> bool:
         return True  # reading the registered shapes then reports the error
 
 
-def frame_of(folder: str | Path) -> dict[str, str] | None:
+def card_frame(folder: str | Path) -> dict[str, str] | None:
     """Card entry ``frame`` for models trained on a prepared folder with fewer than `SMALL_DATA` registered shapes.
 
     None for all other folders, including those scaled to equal radii: registered shapes are learned at equal areas.

@@ -13,12 +13,12 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints, Pickled
+from meshmatch.arrays import Float, Floats, Int, Ints, PickledFields, ShortRepr
 from meshmatch.errors import InputError, TemplateError
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.outputs import replace_on_success
-from meshmatch.shapes.normalise import sqrt_area_frame, unit_sphere_frame
+from meshmatch.shapes.alignment import sqrt_area_frame, unit_sphere_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -36,7 +36,7 @@ _INTEGER_ARRAYS = ("faces", "dense_faces", "labels", "core")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Template(Brief, Pickled):
+class Template(ShortRepr, PickledFields):
     """The reference shape of a category.
 
     Frame: surface area 1, area-weighted centroid at 0; human templates stand y up, face +z, left hand at +x.

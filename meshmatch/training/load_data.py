@@ -20,11 +20,11 @@ from meshmatch.models.registry import TEMPLATE
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import as_path
 from meshmatch.progress import Progress
-from meshmatch.shapes.normalise import Mirroring
+from meshmatch.shapes.alignment import Mirroring
 from meshmatch.templates.prepared_folder import (
     RegisteredShapes,
     ShapeSamples,
-    frame_of,
+    card_frame,
     has_sides,
     read_registered,
     read_samples,
@@ -84,7 +84,7 @@ def _load_prepared(shapes: Path, recipe: Recipe) -> TrainingData:
     """
     template = read_template(shapes / TEMPLATE)
     name = shapes.resolve().name
-    frame = frame_of(shapes) if recipe.deform else None
+    frame = card_frame(shapes) if recipe.deform else None
     mirror: Mirroring = "auto" if has_sides(shapes) else "no"
     if recipe.train.loss.needs_correspondence:
         verts = read_registered(shapes, template)

@@ -15,7 +15,7 @@ from meshmatch.geometry.kernels import KERNELS, Kernel
 from meshmatch.models.checkpoint import Storage
 from meshmatch.models.network import PAPER, NetworkConfig
 from meshmatch.models.trained import TrainedModel
-from meshmatch.templates.prepared_folder import check_prepared, frame_of, is_registered
+from meshmatch.templates.prepared_folder import card_frame, check_prepared, is_registered
 from meshmatch.training.limits import with_changes
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
@@ -172,7 +172,7 @@ def compact() -> Recipe:
     return replace(recipe, network=network, train=train, characters=0.0)
 
 
-def going_on(start: TrainedModel) -> Recipe:
+def fine_tuning(start: TrainedModel) -> Recipe:
     """Recipe for continuing a model's training on shapes that it has fitted: its network and kernel, at a low rate."""
     recipe = people()
     train = replace(recipe.train, steps=1500, rate=1e-4, shapes=16, decay=0.5)
@@ -235,4 +235,4 @@ def recipe_for(
         return paper()
     if shapes is None:
         return compact() if kind in ("hand", "head") else people()
-    return small_data() if frame_of(shapes) else default()
+    return small_data() if card_frame(shapes) else default()

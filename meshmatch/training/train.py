@@ -38,11 +38,11 @@ from meshmatch.shapes.sampling import farthest_points
 from meshmatch.templates.prepared_folder import RegisteredShapes, ShapeSamples
 from meshmatch.templates.template import Template, save_template, template_radius
 from meshmatch.training.aligner import Aligned, train_aligner
-from meshmatch.training.alone import ALIGNER, alone
-from meshmatch.training.alone import CHECKPOINT as CHECKPOINT
 from meshmatch.training.datasets import BatchDataset, CloudDataset, build_lattice
 from meshmatch.training.facts import CardFacts as CardFacts
 from meshmatch.training.facts import fill_from_card
+from meshmatch.training.folder_lock import ALIGNER, exclusive_folder
+from meshmatch.training.folder_lock import CHECKPOINT as CHECKPOINT
 from meshmatch.training.load_data import (
     TrainingData,
     check_start,
@@ -54,7 +54,7 @@ from meshmatch.training.load_data import (
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
 from meshmatch.training.recipe_files import recipe_record
-from meshmatch.training.recipes import Recipe, going_on, recipe_for, small_data
+from meshmatch.training.recipes import Recipe, fine_tuning, recipe_for, small_data
 from meshmatch.training.records import CURVES, METRICS, Metrics, Report, check_curves, combine_reports, curves
 from meshmatch.training.scans import ScanConfig
 
@@ -148,7 +148,7 @@ def train(
         assert start is not None
         if Path(shapes.model).resolve() == output.resolve():
             raise OptionError(f"{output} is the model that made the fits", "choose another folder")
-        facts, recipe = fill_from_card(facts, start.card), recipe or going_on(start)
+        facts, recipe = fill_from_card(facts, start.card), recipe or fine_tuning(start)
     if start is not None:
         # Check this before shapes are made, which may take minutes.
         check_start(start, known_template(shapes, kind, recipe, start), recipe)
@@ -164,7 +164,7 @@ def train(
     return _train_locked(output, facts, recipe, resume, report, tensorboard, load_data, Progress(progress, "training"))
 
 
-@alone
+@exclusive_folder
 def _train_locked(
     output: str | Path, facts: CardFacts, recipe: Recipe, resume: bool, report: Report | None, tensorboard: bool,
     load_data: Callable[[], TrainingData], progress: Progress,

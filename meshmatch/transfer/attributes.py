@@ -14,9 +14,9 @@ from scipy.sparse import csr_array
 from meshmatch.arrays import Float, Floats, Floats32, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import triangle_areas
-from meshmatch.maps.folds import known_normals
+from meshmatch.maps.folds import normals_or_zeros
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces, mean_around
-from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
@@ -114,7 +114,7 @@ def _sampled_votes(
     """(F_target, labels) votes of the sample points of some faces (N,) of the target."""
     spread = lattice(_SUBDIVISIONS)  # (P, 3)
     corners = target.faces[faces]
-    normals = back.apply(known_normals(source))
+    normals = back.apply(normals_or_zeros(source))
     points, facing = (
         np.einsum("pk,nkd->npd", spread, values[corners]).reshape(-1, 3) for values in (back.points(source), normals)
     )

@@ -19,7 +19,7 @@ from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32, UInts8
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Finish, Layer, Pixels
-from meshmatch.shapes.colors import bytes_of
+from meshmatch.shapes.colors import linear_to_bytes
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 from meshmatch.transfer.layers import ColorPainter, NormalPainter, Painter, Samples, SurfacePainter, painted_bytes
@@ -196,7 +196,7 @@ def transfer_tiles(
     return whole, {tile: each.material for tile, each in zip(numbers, baked, strict=True)}
 
 
-def contradicted(source: Shape, look: Appearance, target: Shape, back: VertexMap, atlas: Atlas) -> float:
+def contradicting_share(source: Shape, look: Appearance, target: Shape, back: VertexMap, atlas: Atlas) -> float:
     """Share, by area, of the faces that share their place in the image with another one, whose colors differ from its."""
     walker, look = _prepare_source(source, look)
     locator, sampler = TexelLocator(walker, target, back, atlas.uv * _COMPARE_SIZE), MaterialSampler(look, walker)
@@ -212,7 +212,9 @@ def contradicted(source: Shape, look: Appearance, target: Shape, back: VertexMap
         return 0.0
     x, y = (center[face] * _COMPARE_SIZE).astype(np.float32).T
     one, other = (
-        bytes_of(sampler.colors(place, weights, sampler.footprint(place, locator.reach.take(each)))[:3]).astype(int)
+        linear_to_bytes(sampler.colors(place, weights, sampler.footprint(place, locator.reach.take(each)))[:3]).astype(
+            int
+        )
         for each in (face, other_face[face])
         for _, place, weights in [locator.locate(each, x, y)]
     )

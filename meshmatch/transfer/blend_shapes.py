@@ -14,11 +14,11 @@ from scipy.sparse.csgraph import connected_components
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import dot, triangle_vectors, unit
+from meshmatch.geometry.triangles import dot, normalized, triangle_vectors
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import length_of
-from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.faces import seams
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.clean_weights import same_at
 from meshmatch.transfer.local_frames import local_frames
@@ -53,7 +53,7 @@ def carry_moves(
     moved = np.stack([(matrix @ np.einsum("vij,vj->vi", frames, move)).astype(np.float32) for move in moves])
     graph = vertex_graph(target)
     known = target.valid & (backward.assumed_confidence >= _MIN_CONFIDENCE)
-    facing = unit(backward.apply(np.einsum("vij,vj->vi", rotations, source.vertex_normals)))
+    facing = normalized(backward.apply(np.einsum("vij,vj->vi", rotations, source.vertex_normals)))
     known &= dot(facing, target.vertex_normals) > _MIN_COSINE
     part = _connected_parts(graph)
     has_counterpart = np.bincount(part, known) >= _MIN_KNOWN * np.bincount(part)
@@ -74,7 +74,7 @@ def carry_moves(
         known,
     )
     _close_slits(moved, backward, source, target)
-    welded = same_at(seams(target.verts, target.faces), eye_array(target.V, format="csr"))
+    welded = same_at(seam_representatives(target.verts, target.faces), eye_array(target.V, format="csr"))
     moved = np.stack([(welded @ move).astype(np.float32) for move in moved])
     size = np.linalg.norm(moved, axis=2)
     moved[size <= _NEGLIGIBLE * size.max(axis=1, keepdims=True)] = 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, ShortRepr
 from meshmatch.geometry.frames import RigidPose, kabsch
 from meshmatch.shapes.formats.gltf_rig import Rig
 from meshmatch.shapes.shape import Shape
@@ -33,7 +33,7 @@ _MAX_DISTANCE_RATIO = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CarriedRig(Brief):
+class CarriedRig(ShortRepr):
     """A skeleton on a target, in two poses, without scales. The first node is new, and all others hang from it."""
 
     bind: Rig  # in the target's pose
@@ -62,12 +62,14 @@ def _similarity(
     return _Similarity(scale, RigidPose(rotation, b - scale * rotation @ a))
 
 
-def upright(source: Shape, points: Float[Floats, "V 3"], trust: Float[Floats, " V"]) -> Float[Floats, "3 3"]:
+def rotation_to_upright(
+    source: Shape, points: Float[Floats, "V 3"], trust: Float[Floats, " V"]
+) -> Float[Floats, "3 3"]:
     """Rotation by right angles, about one axis, after which the places of the source's vertices stand along y as it does."""
-    return turn_of(kabsch(source.verts, points, trust).rotation[:, UP])
+    return rotation_to_y(kabsch(source.verts, points, trust).rotation[:, UP])
 
 
-def turn_of(up: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
+def rotation_to_y(up: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
     """Rotation by right angles, about one axis, that takes the axis nearest to a direction to y."""
     axis = int(np.abs(up).argmax())
     if axis == UP:
@@ -77,7 +79,7 @@ def turn_of(up: Float[Floats, " 3"]) -> Float[Floats, "3 3"]:
     return turn
 
 
-def carry(
+def transfer_skeleton(
     rig: Rig,
     weights: csr_array,
     source: Shape,

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import triangle_areas, triangle_vectors, unit
+from meshmatch.geometry.triangles import normalized, triangle_areas, triangle_vectors
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import Layout, adjacent_faces, flatten_faces
@@ -64,7 +64,7 @@ class _Surface:
     def __post_init__(self) -> None:
         self.face_a, self.face_b, self.length = adjacent_faces(self.verts, self.faces)
         vectors = triangle_vectors(self.verts, self.faces)
-        self.areas, self.normals = triangle_areas(self.verts, self.faces), unit(vectors)
+        self.areas, self.normals = triangle_areas(self.verts, self.faces), normalized(vectors)
         self.centers = self.verts[self.faces].mean(axis=1)
         self.total = float(self.areas.sum())
         self.adjacency = self.graph(self.length)
@@ -177,7 +177,7 @@ def _fill_notches(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
     """Complete regions that have most of the angle around a vertex: flattened, they would overlap themselves there."""
     corners, F = surface.faces, len(region)
     ends = [
-        unit(surface.verts[np.roll(corners, -k, axis=1)].reshape(-1, 3) - surface.verts[corners.ravel()])
+        normalized(surface.verts[np.roll(corners, -k, axis=1)].reshape(-1, 3) - surface.verts[corners.ravel()])
         for k in (1, 2)
     ]
     angles = np.arccos(np.clip(np.einsum("ni,ni->n", *ends), -1, 1))

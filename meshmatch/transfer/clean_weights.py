@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.footpoints import Surface
-from meshmatch.shapes.faces import seams
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import joint_table, largest_weights
 from meshmatch.transfer.low_confidence import replace_low_weights, vertex_graph
@@ -38,7 +38,7 @@ def clean_weights(
     one. Weights of ``unknown`` vertices are ignored and filled in like holes.
     """
     graph = vertex_graph(target)
-    twin = np.arange(target.V) if target.is_cloud else seams(target.verts, target.faces)
+    twin = np.arange(target.V) if target.is_cloud else seam_representatives(target.verts, target.faces)
     if unknown is not None and not unknown.all():
         weights = csr_array(diags_array((~unknown).astype(np.float64)) @ weights)
     weights = same_at(twin, largest_weights(weights, influences))
@@ -50,7 +50,9 @@ def clean_weights(
     return _fill_empty_rows(largest_weights(smooth, influences), target)
 
 
-def beyond(target: Shape, points: Float[Floats, "V_source 3"], faces: Int[Ints, "F 3"]) -> Bool[Bools, " V_target"]:
+def find_uncovered(
+    target: Shape, points: Float[Floats, "V_source 3"], faces: Int[Ints, "F 3"]
+) -> Bool[Bools, " V_target"]:
     """(V_target,) vertices far from the mapped surface of the source, such as long hair that the source lacks.
 
     A map takes these to whatever is nearest: hair that hangs down, to the back. All False where the map places the source
@@ -132,7 +134,7 @@ def _fill_empty_rows(weights: csr_array, target: Shape) -> csr_array:
     return csr_array(weights[rows])
 
 
-def rigid(weights: csr_array, groups: list[tuple[Int[Ints, " N"], Int[Ints, " M"]]]) -> csr_array:
+def make_rigid(weights: csr_array, groups: list[tuple[Int[Ints, " N"], Int[Ints, " M"]]]) -> csr_array:
     """Move groups of vertices rigidly: each with the joint that has most of the weight of the vertices ``beside`` it, or of
     its own vertices where there are none. ``groups`` are pairs of (own vertices, vertices beside).
     """

@@ -12,8 +12,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import SuperLU
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.smoothing import factors
-from meshmatch.geometry.triangles import flat_areas, same_rows, signed_areas, together, triangle_areas, unit
+from meshmatch.geometry.smoothing import factorize
+from meshmatch.geometry.triangles import (
+    component_minima,
+    normalized,
+    planar_areas,
+    same_rows,
+    signed_areas,
+    triangle_areas,
+)
 from meshmatch.transfer.texels import draw_triangles
 
 # All of these were set by hand.
@@ -92,7 +99,7 @@ def flatten_faces(
     uv = _untangle(uv, corners)
     if _stretch(uv[corners], flat, own) > max_stretch:
         return None
-    uv *= np.sqrt(own.sum() / flat_areas(uv[corners]).sum())
+    uv *= np.sqrt(own.sum() / planar_areas(uv[corners]).sum())
     return Layout.of(uv, corners, own > _MIN_VISIBLE * areas, min_texels)
 
 
@@ -137,7 +144,7 @@ def _has_simple_border(uv: Floats, corners: Ints) -> bool:
     ):  # or several loops at one corner
         return False
     a, b = uv[begin], uv[end]
-    loop = together(M, begin, end)[begin]
+    loop = component_minima(M, begin, end)[begin]
     if (np.bincount(loop, a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0).sum() != 1:
         return False
     along, other = b - a, a[None] - a[:, None]
@@ -161,7 +168,7 @@ def weld(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> Int[Ints, "F 3
     one, two = opposite_edges(same_rows(verts)[free])
     begin = [short[:, 0], free[one, 0], free[one, 1]]
     end = [short[:, 1], free[two, 1], free[two, 0]]
-    return together(len(verts), np.concatenate(begin), np.concatenate(end))[faces]
+    return component_minima(len(verts), np.concatenate(begin), np.concatenate(end))[faces]
 
 
 def adjacent_faces(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"]) -> tuple[Ints, Ints, Floats]:
@@ -177,8 +184,8 @@ def flat_triangles(corners: Float[Floats, "F 3 3"]) -> Float[Floats, "F 3 2"]:
     base = np.linalg.norm(along, axis=1)
     flat = np.zeros((len(corners), 3, 2))
     flat[:, 1, 0] = base
-    flat[:, 2, 0] = np.einsum("fi,fi->f", other, unit(along))
-    height = np.linalg.norm(other - flat[:, 2, :1] * unit(along), axis=1)
+    flat[:, 2, 0] = np.einsum("fi,fi->f", other, normalized(along))
+    height = np.linalg.norm(other - flat[:, 2, :1] * normalized(along), axis=1)
     flat[:, 2, 1] = np.maximum(height, _MIN_HEIGHT * np.maximum(base, np.linalg.norm(other, axis=1)))
     return flat
 
@@ -200,8 +207,8 @@ def _weld_corners(faces: Int[Ints, "F 3"]) -> tuple[Int[Ints, "F 3"], bool]:
     one, two = opposite_edges(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     corner = np.arange(3 * F)
     begin, end = corner, corner.reshape(F, 3)[:, [1, 2, 0]].ravel()
-    welded = together(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))
-    connected = not together(F, one // 3, two // 3).any()
+    welded = component_minima(3 * F, np.concatenate([begin[one], end[one]]), np.concatenate([end[two], begin[two]]))
+    connected = not component_minima(F, one // 3, two // 3).any()
     return np.unique(welded, return_inverse=True)[1].reshape(F, 3), connected
 
 
@@ -224,7 +231,7 @@ def _conformal_layout(points: Floats, corners: Ints, flat: Floats, areas: Floats
         right = np.bincount(rows[fixed], pulled.real, M) + 1j * np.bincount(rows[fixed], pulled.imag, M)
         found[free] = _factorize(products, rows, columns, free).solve(right[free])
     uv = np.stack([found.real, found.imag], axis=1)
-    return np.asarray(uv * np.sqrt(areas.sum() / max(flat_areas(uv[corners]).sum(), 1e-300)))
+    return np.asarray(uv * np.sqrt(areas.sum() / max(planar_areas(uv[corners]).sum(), 1e-300)))
 
 
 def _rigid_layouts(uv: Floats, corners: Ints, flat: Floats) -> Iterator[Float[Floats, "M 2"]]:
@@ -259,7 +266,7 @@ def _factorize(values: NDArray[Any], rows: Ints, columns: Ints, selected: Bools)
     place = np.cumsum(selected) - 1
     both, count = selected[rows] & selected[columns], int(selected.sum())
     matrix = coo_array((values[both], (place[rows[both]], place[columns[both]])), shape=(count, count)).tocsc()
-    return factors(matrix)
+    return factorize(matrix)
 
 
 def _untangle(uv: Floats, corners: Ints) -> Floats:

@@ -17,13 +17,13 @@ from scipy.sparse import diags_array
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.fitting.solve.priors import nearest_rotations
-from meshmatch.geometry.smoothing import laplacian, solved
+from meshmatch.geometry.smoothing import laplacian, solve_positive_definite
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import dot, edge_lengths, edges_of, interpolate, same_rows, unit
+from meshmatch.geometry.triangles import dot, edge_lengths, edges_of, interpolate, normalized, same_rows
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
-from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.shapes.repair import turned_outwards
+from meshmatch.shapes.repair import oriented_outwards
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.local_frames import local_frames
 
@@ -78,7 +78,7 @@ def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Sha
     first, back = np.unique(same_rows(garment.verts), return_inverse=True)  # welded, so that seams stay closed
     cloth = _Cloth(garment.verts[first], back[garment.faces], jacobians[first])
     places = bound[first]
-    heights_before = _Skin(turned_outwards(source)).heights(cloth.at_points(cloth.rest), workers)[0]
+    heights_before = _Skin(oriented_outwards(source)).heights(cloth.at_points(cloth.rest), workers)[0]
     at = heights_before[: len(first)][back]
     sits = float((at < 0).mean()), float((at > _FAR * length_of(source)).mean())
     if target.is_cloud:
@@ -88,7 +88,7 @@ def carry_garment(garment: Shape, forward: VertexMap, source: Shape, target: Sha
     heights_before = heights_before * cloth.at_points(scale[:, None])[:, 0]
     min_heights = np.minimum(heights_before, _CLEARANCE * length_of(target))
     min_heights[heights_before > 0] = np.maximum(min_heights[heights_before > 0], _MIN_HEIGHT * length_of(target))
-    verts, pushed, heights = _push_out(cloth, places, min_heights, _Skin(turned_outwards(target)), workers)
+    verts, pushed, heights = _push_out(cloth, places, min_heights, _Skin(oriented_outwards(target)), workers)
     sunk = (heights < 0) & (heights_before[: len(first)] > 0)
     return Carried(verts[back], turns, np.flatnonzero(pushed[back]), np.flatnonzero(sunk[back]), *sits)
 
@@ -156,7 +156,7 @@ class _Cloth:
     def solve(self, places: Floats, weights: Floats) -> Floats:
         """Vertices near places (V, 3) with weights (V,), with edges of nearly their shape (a sparse linear system)."""
         matrix = (self._laplacian + diags_array(weights)).tocsr()
-        return solved(matrix, self._pull + weights[:, None] * places, places)
+        return solve_positive_definite(matrix, self._pull + weights[:, None] * places, places)
 
 
 class _Skin:
@@ -171,7 +171,7 @@ class _Skin:
         found = self._mesh.query(points, workers=workers)
         corners = corners_of(self._body.faces, found.face, found.vertex)
         foot = interpolate(self._body.verts, corners, found.barycentric)
-        outwards = unit(interpolate(self._body.vertex_normals, corners, found.barycentric))
+        outwards = normalized(interpolate(self._body.vertex_normals, corners, found.barycentric))
         below = dot(points - foot, outwards) < 0
         return np.where(below, -1.0, 1.0) * found.distance, outwards
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import together, triangle_areas
+from meshmatch.geometry.triangles import component_minima, triangle_areas
 from meshmatch.transfer.flat_layout import Layout, flatten_faces, opposite_edges
 from meshmatch.transfer.pack_charts import Chart, hull_area
 
@@ -240,7 +240,7 @@ def _merge(a: Chart, b: Chart, hinge: _Edges) -> Chart:
     rotation, shift = _rigid_motion(p[one], q[two])
     N, both = len(p), np.concatenate([p, rotation * q + shift])
     both[one] = 0.5 * (both[one] + both[N + two])
-    number = together(len(both), one, N + two)
+    number = component_minima(len(both), one, N + two)
     kept_corners, place = np.unique(number, return_inverse=True)
     uv = np.stack([both[kept_corners].real, both[kept_corners].imag], axis=1)
     corners = place[np.concatenate([a.corners, b.corners + N])]

@@ -15,14 +15,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meshmatch.arrays import Brief, Int, Ints
+from meshmatch.arrays import Int, Ints, ShortRepr
 from meshmatch.errors import InputError, OptionError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes import tables
 from meshmatch.shapes.colors import label_colors
 from meshmatch.shapes.input_files import read_json, read_npy, read_text
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.tables import is_missing, is_number, number, read_table, unquoted
+from meshmatch.shapes.tables import is_missing, is_number, parse_number, read_table, unquoted
 
 On = Literal["vertices", "faces"]
 Label = int | str
@@ -33,7 +33,7 @@ _HINT = "one label for each vertex or triangle of the source, in the order of it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Labels(Brief):
+class Labels(ShortRepr):
     """Labels of the vertices or faces of a shape."""
 
     codes: Int[Ints, " N"]  # index into `names`; -1 for none
@@ -60,7 +60,7 @@ class Labels(Brief):
         return number
 
 
-def named(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
+def name_labels(codes: Ints, given: Labels, on: On, blank: str | None) -> Labels:
     """Labels of a target, with the names of `given`; others become `blank`, by default -1 among numbers, "" among words."""
     empty: Label = given.check_blank(blank) if blank is not None else ("" if given.are_words else -1)
     if (codes >= 0).all():
@@ -135,7 +135,7 @@ def _parse_whole(value: Any) -> int | None:
                 return int(value)
             if not _AS_FLOAT.fullmatch(value.strip()):
                 return None
-            value = number(value)
+            value = parse_number(value)
         return int(value) if isinstance(value, int) or float(value) == int(value) else None
     except (ValueError, TypeError, OverflowError):
         return None

@@ -14,17 +14,17 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, ShortRepr
 from meshmatch.errors import InputError, warn
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.folds import known_normals
+from meshmatch.maps.folds import normals_or_zeros
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import MappedMesh, discontinuous_faces
-from meshmatch.maps.named_places import corners_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import tables
 from meshmatch.shapes.landmark_files import (
     LANDMARK_READERS,
-    READERS_OF_SEVERAL,
+    SPECIMEN_READERS,
     LandmarkFile,
     Markup,
     Space,
@@ -52,7 +52,7 @@ _HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Landmarks(Brief):
+class Landmarks(ShortRepr):
     """Named points on a shape, in its frame and unit. Missing ones have position nan, and vertex and face -1."""
 
     names: tuple[str, ...]
@@ -164,7 +164,7 @@ def push_landmarks(forward: VertexMap, source: Shape, target: Shape, landmarks: 
     if len(inside):
         corners = source.faces[landmarks.face[inside]]
         share = landmarks.barycentric[inside]
-        facing = interpolate(known_normals(target), forward.index[corners], share)
+        facing = interpolate(normals_or_zeros(target), forward.index[corners], share)
         places = MappedMesh.of(target).query(interpolate(forward.points(target), corners, share), facing)
         vertex[inside], face[inside], weights[inside] = places.vertex, places.face, places.barycentric
         confidence[inside] = np.einsum("nk,nk->n", share, forward.confidence[corners])
@@ -209,7 +209,7 @@ def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -
     landmarks, furthest = load_landmarks(path, shape, space)
     for note in landmarks.notes:
         warn(note)
-    warn_of_far_ones(shape, furthest)
+    warn_if_far(shape, furthest)
     return landmarks
 
 
@@ -237,7 +237,7 @@ def known_pairs(
     return read[0].vertex, read[1].vertex
 
 
-def warn_of_far_ones(shape: Shape, furthest: float) -> None:
+def warn_if_far(shape: Shape, furthest: float) -> None:
     """Warn if the landmark farthest from the shape is clearly not on it."""
     if furthest > _FAR * shape.diagonal:
         share = f"{100 * furthest / shape.diagonal:.0f} % of its diagonal"
@@ -343,13 +343,13 @@ def landmark_positions(path: Path) -> Float[Floats, "L 3"]:
 
     def read(path: Path) -> Floats:
         reader = LANDMARK_READERS[path.suffix.lower()]
-        records = reader(path, "") if reader in READERS_OF_SEVERAL else reader(path)
+        records = reader(path, "") if reader in SPECIMEN_READERS else reader(path)
         return np.array([record.get("position") or [np.nan] * 3 for record in records], np.float64).reshape(-1, 3)
 
     return tables.read_by_suffix(path, dict.fromkeys(LANDMARK_READERS, read), "landmarks", _HINT)
 
 
-def size_beside(points: Float[Floats, "L 3"], others: Float[Floats, "L 3"]) -> float:
+def relative_size(points: Float[Floats, "L 3"], others: Float[Floats, "L 3"]) -> float:
     """Size of a set of landmarks relative to the same ones on another shape; 0 if fewer than two are on both."""
     both = np.isfinite(points + others).all(axis=1)
     size, other = (

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Floats, Floats32, Ints, Ints32
 from meshmatch.geometry.triangles import cross_product
 from meshmatch.shapes.appearance import Appearance, Finish, Pixels
-from meshmatch.shapes.colors import bytes_of
-from meshmatch.shapes.formats.gltf_out import smooth_normals
+from meshmatch.shapes.colors import linear_to_bytes
+from meshmatch.shapes.formats.gltf_write import smooth_normals
 from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents
 from meshmatch.transfer.surface_walk import SurfaceWalker, weighted_sum
 from meshmatch.transfer.texel_colors import MaterialSampler, TexelLocator
@@ -149,6 +149,6 @@ def painted_bytes(painter: Painter, amounts: Floats32) -> Pixels:
     """(N, 4) image bytes of amounts and alpha (4, N)."""
     out = np.empty((amounts.shape[1], 4), np.uint8)
     shares = np.round(np.clip(amounts, 0, 1) * 255)
-    out[:, :3] = shares[:3].T if painter.linear else bytes_of(amounts[:3]).T
+    out[:, :3] = shares[:3].T if painter.linear else linear_to_bytes(amounts[:3]).T
     out[:, 3] = shares[3]
     return out

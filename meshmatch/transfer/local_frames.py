@@ -7,16 +7,16 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.solve.priors import nearest_rotations
-from meshmatch.geometry.smoothing import averaged
+from meshmatch.geometry.smoothing import smooth_values
 from meshmatch.geometry.triangles import edge_lengths, is_discontinuous
-from meshmatch.maps.folds import facing, normals_at
+from meshmatch.maps.folds import normals_at, orientation_agreement
 from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
 # Set by hand, in units of sqrt(area): distance over which rotations and scales are averaged.
 _AVERAGING = 0.06
-_INSIDE_OUT = -0.5  # lower limit of `facing`, -1 to 1: three quarters of the surface are flipped
+_INSIDE_OUT = -0.5  # lower limit of `orientation_agreement`, -1 to 1: three quarters of the surface are flipped
 
 
 def local_frames(
@@ -32,7 +32,7 @@ def local_frames(
         raise InputError(f"{name} is a point cloud, which has no surface", "give a mesh")
     image = forward.points(target)
     normals = normals_at(forward, target)
-    if facing(image, normals, source.verts, source.faces[source.valid_faces]) < _INSIDE_OUT:
+    if orientation_agreement(image, normals, source.verts, source.faces[source.valid_faces]) < _INSIDE_OUT:
         hint = "mirror one of the files, or match without mirror images (--mirror no)"
         raise OptionError(f"{name} matches as a mirror image: what is carried would be inside out", hint)
     edges = source.edges.vertices.astype(np.int64)
@@ -49,7 +49,7 @@ def local_frames(
     scale = float(sums[:, 9].sum() / max(sums[:, 10].sum(), 1e-300))
     outwards = 0.5 * scale * sums[:, 10, None, None] * normals[:, :, None] * source.vertex_normals[:, None, :]
     sums[:, :9] += outwards.reshape(-1, 9)
-    sums = averaged(sums, np.ones(source.V), edges, length, _AVERAGING * length_of(source))
+    sums = smooth_values(sums, np.ones(source.V), edges, length, _AVERAGING * length_of(source))
     averaged_products = sums[:, :9].reshape(-1, 3, 3)
     rotations = nearest_rotations(averaged_products, np.broadcast_to(np.eye(3), averaged_products.shape))
     ratio = np.maximum(sums[:, 9], 0.0) / np.maximum(sums[:, 10], 1e-300)

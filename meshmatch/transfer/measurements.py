@@ -19,13 +19,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from meshmatch.arrays import Bool, Bools, Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import squared_lengths
 from meshmatch.shapes import tables
-from meshmatch.shapes.faces import seams
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.input_files import read_json
-from meshmatch.shapes.landmark_files import one_line
+from meshmatch.shapes.landmark_files import one_line_name
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import Landmarks, at_faces, join_landmarks
 
@@ -84,7 +84,7 @@ class Measurement:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measurements(Brief):
+class Measurements(ShortRepr):
     """Results of measurements of a shape.
 
     Attributes
@@ -187,7 +187,7 @@ def load_measurements(path: str | Path) -> tuple[Measurement, ...]:
 
 
 def _read(path: Path) -> tuple[Measurement, ...]:
-    rows = [[one_line(cell) for cell in row] for row in tables.read_table(path, blanks=False).rows(even=False)]
+    rows = [[one_line_name(cell) for cell in row] for row in tables.read_table(path, blanks=False).rows(even=False)]
     if rows and rows[0][1:2] and rows[0][1].lower() == "kind":
         rows = rows[1:]
     measurements = []
@@ -197,10 +197,10 @@ def _read(path: Path) -> tuple[Measurement, ...]:
         if row:
             name, kind, *landmarks = [*row, ""] if len(row) < 2 else row
             measurements.append(Measurement(name, kind.lower(), tuple(landmarks)))  # type: ignore[arg-type]
-    return each_once(measurements)
+    return check_unique(measurements)
 
 
-def each_once(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
+def check_unique(measurements: Sequence[Measurement]) -> tuple[Measurement, ...]:
     """Measurements as a tuple; `InputError` where two have the same name, or there are none."""
     seen: set[str] = set()
     measurements = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
@@ -240,7 +240,7 @@ def measured_values(path: Path) -> dict[str, float]:
         records = tables.read_by_suffix(path, {".json": _read_json}, "measurements", _HINT)
         return {str(each["name"]): float("nan" if each["value"] is None else each["value"]) for each in records}
     rows = tables.read_by_suffix(path, {".csv": _read_csv}, "measurements", _HINT)
-    return {name: tables.number(value) for name, _, value, *_ in rows[1:]}
+    return {name: tables.parse_number(value) for name, _, value, *_ in rows[1:]}
 
 
 def _read_csv(path: Path) -> list[list[str]]:
@@ -264,7 +264,7 @@ class _LandmarkIndex:
 
     @staticmethod
     def _key(name: str) -> str:
-        return normalize("NFC", one_line(name))
+        return normalize("NFC", one_line_name(name))
 
     def rows(self, measurement: Measurement) -> Int[Ints, " N"]:
         """(N,) rows of a measurement's landmarks; `InputError` if a name is ambiguous or unknown, or a landmark missing."""
@@ -295,7 +295,7 @@ class _Surface:
     @cached_property
     def twin(self) -> Int[Ints, " V"]:
         """(V,) the vertex to use instead of each, where the file duplicates vertices along seams."""
-        return seams(self.shape.verts, self.faces)
+        return seam_representatives(self.shape.verts, self.faces)
 
     def cross_section(self, points: Float[Floats, "3 3"], name: str) -> tuple[Landmarks, Float[Floats, " N"]]:
         """Cross section of the surface for a girth: in the plane through the first point, perpendicular to the direction

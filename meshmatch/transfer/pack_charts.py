@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_cdt
 from scipy.spatial import ConvexHull, QhullError
 
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import flat_areas
+from meshmatch.geometry.triangles import planar_areas
 from meshmatch.transfer.texels import covered_texels
 from meshmatch.transfer.tighten_charts import tighten
 
@@ -117,7 +117,7 @@ class _Piece:
         self.low = (uv @ self.rotation).min(axis=0)
         self.uv, self.corners = self.align(uv), corners
         self.size = self.uv.max(axis=0)
-        self.area = float(flat_areas(self.uv[corners]).sum())
+        self.area = float(planar_areas(self.uv[corners]).sum())
         edges = corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         key = edges.min(axis=1) * len(uv) + edges.max(axis=1)
         first, count = np.unique(key, return_index=True, return_counts=True)[1:]

@@ -11,7 +11,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Ints, Ints32
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.triangles import flat_areas, interpolate
+from meshmatch.geometry.triangles import interpolate, planar_areas
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.shape import Shape
@@ -50,7 +50,7 @@ def source_layout(
     if polygons is not None:  # all triangles of a polygon take the place of its first
         first, number = np.unique(polygons, return_index=True, return_inverse=True)[1:]
         place = place[first][number.reshape(-1)]
-    size = np.sqrt(flat_areas(uv_in_tile) / np.maximum(walker.areas, 1e-300))  # image length per length on the source
+    size = np.sqrt(planar_areas(uv_in_tile) / np.maximum(walker.areas, 1e-300))  # image length per length on the source
     out = np.empty((target.F, 3, 2))
     for k in range(3):
         face, weights = bounded.reach(images[:, k].T.astype(np.float32, order="C"), place)

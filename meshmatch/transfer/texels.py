@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32, UInts8
 from meshmatch.shapes.appearance import Appearance, Material, Pixels, Wrap
-from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of
+from meshmatch.shapes.colors import BYTE_TO_LINEAR, linear_to_bytes
 
 _CHUNK = 1 << 21  # texels
 _BAND = 64  # rows of an image that are processed together
@@ -139,7 +139,7 @@ def _next_level(pixels: Pixels, weight: UInts8 | Floats32, linear: bool) -> tupl
     """Weighted means of 2 x 2 pixels, and the weight sums, at most 1; outside the image weights are 0."""
     out = np.zeros((*_half_shape(weight.shape), 4), np.uint8)
     total = np.zeros(out.shape[:2], np.float32)
-    table = _BYTE_VALUES if linear else LINEAR_OF_BYTE
+    table = _BYTE_VALUES if linear else BYTE_TO_LINEAR
     for rows, whole in _bands(weight.shape):
         part, part_weights = _pad_even(pixels[whole]), _pad_even(weight[whole])
         shares = part_weights if part_weights.dtype == np.float32 else _BYTE_SHARES.take(part_weights)
@@ -149,7 +149,7 @@ def _next_level(pixels: Pixels, weight: UInts8 | Floats32, linear: bool) -> tupl
             amounts = _BYTE_VALUES if k == 3 else table
             sums = _sum_of_quads([amounts.take(part[(*at, k)]) * shares[at] for at in _QUADS])
             mean = (sums / safe).astype(np.float32)
-            out[rows, :, k] = np.round(mean) if amounts is _BYTE_VALUES else bytes_of(mean)
+            out[rows, :, k] = np.round(mean) if amounts is _BYTE_VALUES else linear_to_bytes(mean)
         total[rows] = np.minimum(weights_sum, np.float32(1.0))
     return out, total
 
@@ -202,7 +202,7 @@ class Pyramid:
         if known is not None:
             weight *= known
         levels = fill(pixels, weight, material.linear)
-        self.table = _BYTE_SHARES if material.linear else LINEAR_OF_BYTE
+        self.table = _BYTE_SHARES if material.linear else BYTE_TO_LINEAR
         if material.alpha != "opaque":  # colors are filled in, but not the holes between them
             pixels[..., 3] = alpha
             means: UInts8 | Floats32 = alpha

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from meshmatch.arrays import Brief, Float, Floats, Int, Ints
+from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.triangles import flat_areas
+from meshmatch.geometry.triangles import planar_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import weld
 from meshmatch.transfer.new_charts import new_charts
@@ -35,7 +35,7 @@ _MAX_EDGE = 500.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Atlas(Brief):
+class Atlas(ShortRepr):
     """Texture coordinates that give every point of a surface its own place in an image."""
 
     uv: Float[Floats, "F 3 2"]  # within 0..1, u to the right, v down; zeros for a face without area
@@ -149,7 +149,7 @@ def _check_coordinates(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str
     if n_outside:
         return out, f"{n_outside} faces reach out of range, over the edge of the image", 0.0
     uv = np.clip(out, 0.0, 1.0)
-    room = flat_areas(uv)
+    room = planar_areas(uv)
     if room.sum() < _MIN_USED:
         return uv, f"they use only {100 * room.sum():.1f} % of the image", 0.0
     if layers := too_many_layers(uv, size):
@@ -186,7 +186,7 @@ def tiles_of(shape: Shape, uv: Float[Floats, "F 3 2"], size: int) -> Int[Ints, "
     if crosses_tiles[real].any() or len(found) < 2 or len(found) * size**2 > _MAX_TEXELS:
         return None
     within = np.clip(_into_unit_square(uv, shape), 0.0, 1.0)
-    room, due = flat_areas(within), shape.face_areas / shape.face_areas.sum()
+    room, due = planar_areas(within), shape.face_areas / shape.face_areas.sum()
     if room.sum() < _MIN_USED or due[room < _STARVED * due].sum() > _MAX_STARVED:
         return None
     if not too_many_layers(within, size) and shared_texels(within, size) <= _MAX_OVERLAP:
@@ -200,7 +200,7 @@ def tiles_of(shape: Shape, uv: Float[Floats, "F 3 2"], size: int) -> Int[Ints, "
 
 def too_many_layers(uv: Float[Floats, "F 3 2"], size: int) -> float:
     """How often triangles cover an image, if that is too often for a comparison texel by texel; else 0."""
-    layers = float(flat_areas(uv).sum())
+    layers = float(planar_areas(uv).sum())
     return layers if layers > _MAX_LAYERS or count_rows(uv * size).sum() > MAX_ROWS else 0.0
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.shapes import tables
-from meshmatch.shapes.colors import light
+from meshmatch.shapes.colors import srgb_to_linear_alpha
 from meshmatch.shapes.dressed_files import save_colored
 from meshmatch.shapes.formats import ply, vtk, vtk_xml
 from meshmatch.shapes.formats.ply_edit import PlyFile
@@ -84,7 +84,7 @@ def _read_text(path: Path, count: int) -> Values:
     if not names and numbers.size == 0:
         raise InputError(f"{path.name} is empty")
     if len(numbers) == count:
-        table.check_no_doubt()
+        table.check_unambiguous()
     if names and names[0].lower() == "vertex":
         tables.check_numbered(numbers[:, 0])
         names, numbers = names[1:], numbers[:, 1:]
@@ -179,7 +179,7 @@ def parse_blank(text: str, columns: int) -> Float[Floats, " D"]:
     return np.array(numbers)
 
 
-def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 4"]:
+def linear_colors(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 4"]:
     """Linear colors and alpha of the vertices of a shape: of its own colors (`InputError` if it has none), or of given sRGB
     ones (V, 3 or 4).
     """
@@ -189,14 +189,14 @@ def light_of(shape: Shape, colors: ArrayLike | None = None) -> Float[Floats, "V 
             raise InputError(
                 problem, "transfer its texture (transfer-texture), or other numbers (--values; transfer_values)"
             )
-        return light(shape.colors)
-    table = checked_colors(np.asarray(colors, np.float64))
+        return srgb_to_linear_alpha(shape.colors)
+    table = check_colors(np.asarray(colors, np.float64))
     if len(table) != shape.V or table.ndim != 2:
         raise InputError(f"colors must be an array of ({shape.V}, 3 or 4), not {table.shape}")
-    return light(np.column_stack([table, np.ones(len(table))])[:, :4])
+    return srgb_to_linear_alpha(np.column_stack([table, np.ones(len(table))])[:, :4])
 
 
-def checked_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
+def check_colors(colors: Float[Floats, "*N C"]) -> Float[Floats, "*N C"]:
     """The same colors; `OptionError` unless they are 3 or 4 numbers within 0..1."""
     if colors.ndim == 0 or colors.shape[-1] not in (3, 4) or not ((colors >= 0) & (colors <= 1)).all():
         hint = "such as 0.5,0.5,0.5 or #808080"
@@ -208,7 +208,7 @@ def parse_color(text: str | None) -> tuple[float, float, float, float] | None:
     """The sRGB color and alpha (0..1) of a text such as #808080; `OptionError` if it is not a color."""
     if text is None:
         return None
-    red, green, blue, alpha = checked_colors(parse_blank(text, 4)).tolist()
+    red, green, blue, alpha = check_colors(parse_blank(text, 4)).tolist()
     return red, green, blue, alpha
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array, issparse
 
-from meshmatch.arrays import Brief
+from meshmatch.arrays import ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes import tables
@@ -28,7 +28,7 @@ _MAX_JOINTS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SkinWeights(Brief):
+class SkinWeights(ShortRepr):
     """The influence of each joint on each vertex."""
 
     matrix: csr_array  # (V, J), not negative; rows sum to 1, or to 0 for a vertex that no joint moves

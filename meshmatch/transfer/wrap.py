@@ -8,13 +8,13 @@ import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Ints
 from meshmatch.fitting.solve.priors import nearest_rotations
-from meshmatch.geometry.smoothing import averaged
+from meshmatch.geometry.smoothing import smooth_values
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, same_rows, unit, vertex_normals
+from meshmatch.geometry.triangles import dot, edge_lengths, interpolate, normalized, same_rows, vertex_normals
 from meshmatch.maps.deformed import surface_rotations
-from meshmatch.maps.folds import known_normals
+from meshmatch.maps.folds import normals_or_zeros
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import MappedMesh, length_of
-from meshmatch.maps.named_places import corners_of
 from meshmatch.shapes.shape import Shape
 
 # All set by hand; lengths in units of sqrt(area).
@@ -57,7 +57,7 @@ def wrap_onto(
     for radius in _RADII:
         step, trust = surface.steps_towards(verts, vertex_normals(verts, faces))
         trust = np.where(bound & mesh.valid, trust, 0.0) + _MIN_WEIGHT
-        verts = verts + averaged(step, trust, edges, edge_lengths(verts, edges), radius * unit_length)
+        verts = verts + smooth_values(step, trust, edges, edge_lengths(verts, edges), radius * unit_length)
     if not bound.all():
         verts = _with_free_parts(mesh, near[own], verts, bound)
     turns = surface_rotations(mesh.verts, verts, faces)
@@ -69,7 +69,7 @@ class _Scan:
 
     def __init__(self, scan: Shape, workers: int) -> None:
         self._scan, self._mesh, self._workers = scan, MappedMesh.of(scan), workers
-        self._normals = known_normals(scan)
+        self._normals = normals_or_zeros(scan)
         self._rim = np.zeros(scan.V, bool)
         self._rim[scan.edges.vertices[scan.edges.sizes == 1]] = True
         self._reach = _REACH * length_of(scan)
@@ -81,7 +81,7 @@ class _Scan:
         foot = interpolate(self._scan.verts, corners, found.barycentric)
         trust = np.exp(-np.square(found.distance / self._reach))
         if not self._scan.is_cloud:
-            facing = unit(interpolate(self._normals, corners, found.barycentric))
+            facing = normalized(interpolate(self._normals, corners, found.barycentric))
             trust *= np.maximum(dot(facing, normals), 0.0)
             on_rim = (self._rim[corners] | (found.barycentric < 1e-9)).all(axis=1)
             trust[on_rim] = 0.0

@@ -14,7 +14,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import LatentRefineConfig
 from meshmatch.fitting.judge.features import FitFeatures
 from meshmatch.fitting.judge.reasons import Reason
-from meshmatch.fitting.usual import FAIR, Usual
+from meshmatch.fitting.reference_statistics import MIN_FAIR_TRUST, Usual
 from meshmatch.models.registry import find_model, load_once
 from meshmatch.shapes.files import save_shape
 from tests.conftest import icosphere, some_fit
@@ -83,7 +83,7 @@ def test_a_fit_is_judged_beside_what_its_model_learned_from() -> None:
     assert (sound.verdict, sound.reasons) == ("good", ())
     assert (torn.verdict, far.verdict) == ("fair", "poor")
     assert "stands out of what blob learned from" in torn.reasons[0]
-    assert sound.trust > 0.9 > torn.trust > FAIR > far.trust > 0
+    assert sound.trust > 0.9 > torn.trust > MIN_FAIR_TRUST > far.trust > 0
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 import meshmatch
 from meshmatch.api import kinds
 from meshmatch.api.direct import match_without_model
-from meshmatch.api.inputs import usable
+from meshmatch.api.inputs import repair_allowing_parts
 from meshmatch.api.matcher import Matcher
 from meshmatch.cli.app import app
 from meshmatch.errors import InputError, OptionError
-from meshmatch.fitting import alike, direct
+from meshmatch.fitting import direct, same_pose
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.maps.deformed import deformed
 from meshmatch.shapes.repair import repair
@@ -77,8 +77,8 @@ def test_a_map_of_a_model_that_is_not_good_gives_way_to_a_better_one(
     direct_verdict: Any, over_guess: float, taken: bool, found: Any, shapes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = replace(found.target, verdict=direct_verdict)
-    monkeypatch.setattr(direct, "match_either_side", lambda *_: replace(found, target=target, over_guess=over_guess))
-    clean, configs = [usable(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
+    monkeypatch.setattr(direct, "match_either_side", lambda *_: replace(found, target=target, guess_lead=over_guess))
+    clean, configs = [repair_allowing_parts(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
     by_model: Any = SimpleNamespace(source_fit=replace(found.source, model="human"), target_fit=found.target)
     result = match_without_model(clean, configs, None, 1, None, guess=by_model)
     assert (result is not by_model) == taken
@@ -92,8 +92,8 @@ def test_a_pair_may_be_alike_unless_something_is_known_of_it(
     """Landmarks and the map of a model have been heeded by the search, and would not be again."""
     part = replace(found, source=replace(found.source, partial=True), target=replace(found.target, seconds=1e6))
     monkeypatch.setattr(direct, "match_either_side", lambda *_: found)
-    monkeypatch.setattr(alike, "match_alike", lambda *_: part)
-    clean, configs = [usable(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
+    monkeypatch.setattr(same_pose, "refine_match", lambda *_: part)
+    clean, configs = [repair_allowing_parts(shape) for shape in shapes], [meshmatch.FitConfig()] * 2
     result = match_without_model(clean, configs, None, 1, None)
     assert "source: taken for a part of target" in result.notes
     assert result.seconds < 1e6  # of all that was done, not of one fit
@@ -108,9 +108,9 @@ def test_a_mirror_image_is_taken_unless_it_is_not_wanted(
     frame = direct.MIRROR.compose(found.target.frame)
     image = replace(found, target=replace(found.target, frame=frame))
     monkeypatch.setattr(direct, "match_either_side", lambda *_: image)
-    monkeypatch.setattr(alike, "match_alike", lambda *given: given[2])
+    monkeypatch.setattr(same_pose, "refine_match", lambda *given: given[2])
     monkeypatch.setattr(direct, "match_directly", lambda *_: found)
-    clean = [usable(shape) for shape in shapes]
+    clean = [repair_allowing_parts(shape) for shape in shapes]
     for mirror, said in ((None, True), ("no", False)):
         result = match_without_model(clean, [meshmatch.FitConfig(mirror=mirror)] * 2, None, 1, None)
         assert ("target: taken for a mirror image of source" in result.notes) == said

@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 
 import meshmatch
 from meshmatch.api.symmetry import Symmetry
-from meshmatch.fitting.across import image_in
 from meshmatch.fitting.search.planes import MirrorPlane, mirror_planes
+from meshmatch.fitting.self_symmetry import mirror_image
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import mirrored
+from meshmatch.templates.mirror_images import mirrored
 
 LIMBS = (((1, 0.3, 0.2), 0.9, 0.05), ((0.5, -1, 0.3), 1.2, 0.04), ((0, 0.7, 1), 0.8, 0.06))
 BUMP = np.array([0.75, 0.2, -0.7]) / np.linalg.norm([0.75, 0.2, -0.7])
@@ -98,6 +98,6 @@ def test_a_plane_is_found_between_mirror_images() -> None:
 def test_mirror_images_keep_vertices_without_a_position() -> None:
     shape = Shape.with_invalid(np.array([[np.nan] * 3, [1, 0, 0], [0, 2, 0], [0, 0, 3]]), np.array([[1, 2, 3]]), "torn")
     plane = MirrorPlane(np.array([1.0, 0, 0]), 0.0)
-    for image in (image_in(plane, shape), mirrored(shape)):
+    for image in (mirror_image(plane, shape), mirrored(shape)):
         np.testing.assert_array_equal(image.verts_or_nan, shape.verts_or_nan * [-1, 1, 1])
         np.testing.assert_array_equal(image.faces, [[3, 2, 1]])

@@ -8,8 +8,8 @@ import pytest
 
 import meshmatch
 from meshmatch.errors import MeshmatchWarning
+from meshmatch.shapes.deformed_files import save_moved
 from meshmatch.shapes.formats.ply import parsed
-from meshmatch.shapes.moved_files import save_moved
 
 VERTICES = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0.5, 0)]
 PLY = (

@@ -11,7 +11,7 @@ import trimesh
 
 import meshmatch
 from meshmatch.api import kinds, matcher
-from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.inputs import as_model, repair_or_raise
 from meshmatch.api.kinds import Installed
 from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError, ModelError, OptionError
@@ -62,7 +62,7 @@ def poor_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def choose(*shapes: Shape, settled: TrainedModel | None = None) -> tuple[str, list[str]]:
-    choice = kinds.choose_model([validated(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
+    choice = kinds.choose_model([repair_or_raise(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
     return choice.model.card.name, choice.notes
 
 
@@ -161,8 +161,8 @@ def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("models")
 def test_a_shape_that_is_said_to_be_a_part_is_not_fitted_to_tell_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(classify, "Fitter", None)
-    part, config = validated(ball("half 7 7 5.5", opened=True)), FitConfig(partial="yes")
-    choice = kinds.choose_model([part, validated(ball("man 3 4 6"))], [config] * 2)
+    part, config = repair_or_raise(ball("half 7 7 5.5", opened=True)), FitConfig(partial="yes")
+    choice = kinds.choose_model([part, repair_or_raise(ball("man 3 4 6"))], [config] * 2)
     assert choice.model.card.name == "human" and "may be a part" in choice.notes[0]
     assert kinds.choose_model([part], [config]).model.card.name == "quadruped"  # alone, what reads it best
 
@@ -172,7 +172,7 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
     assert choose(strange) == ("human", ["robot 5.5 5.6 7: human"])
-    unrefined = kinds.choose_model([validated(strange)], [FitConfig(refine="none")])
+    unrefined = kinds.choose_model([repair_or_raise(strange)], [FitConfig(refine="none")])
     assert (unrefined.model.card.name, unrefined.fits) == ("human", [None])  # a refined fit is not what was asked for
     monkeypatch.setattr(matcher, "Fitter", None)  # what told the kind is not fitted again
     fit = Matcher().fit(strange)
@@ -245,7 +245,7 @@ def test_a_whole_shape_decides_before_a_part(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_are_told_apart() -> None:
     names = "climber", "dancer", "calf", "fox"
-    shapes = [validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape for name in names]
+    shapes = [repair_or_raise(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape for name in names]
     models = [Installed.loaded(as_model(name)) for name in ("human", "quadruped")]
     found = kinds.category_residuals(models, shapes, [CONFIG] * 4)
     assert (found[0, :2] < 0.042).all() and found[1, 0] > 0.05
@@ -262,7 +262,7 @@ def test_samples_are_told_apart() -> None:
 def test_hands_and_heads_are_told_apart() -> None:
     models = kinds.installed_models()
     for name, kind in (("waving", "hand"), ("pointing", "hand"), ("laughing", "head"), ("child", "head")):
-        shape = validated(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
+        shape = repair_or_raise(meshmatch.load_shape(SAMPLES / f"{name}.ply")).shape
         readings = kinds.category_residuals(models, [shape], [CONFIG])
         assert kinds.classify_shapes(models, readings, [shape], [CONFIG])[0].kind == kind, name
         own = [model.card.category for model in models].index(kind)

@@ -15,7 +15,7 @@ from meshmatch.errors import MeshmatchError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.geometry.triangles import interpolate
-from meshmatch.maps.named_places import corners_of
+from meshmatch.maps.indices import corners_of
 from meshmatch.shapes.shape import Shape
 from tests.conftest import some_fit
 

@@ -23,7 +23,7 @@ from meshmatch.collections.collection import Collection
 from meshmatch.errors import InputError, MeshmatchError, ModelError, OptionError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.maps.fit_files import load_words
+from meshmatch.maps.fit_files import read_fit_header
 from meshmatch.maps.places import PlacedFit, Places
 from meshmatch.models.registry import load_model
 from meshmatch.models.trained import TrainedModel
@@ -150,7 +150,7 @@ def test_files_of_fits_are_refused_in_words(folder: Path, result: MatchResult, t
         load_fit(path)
     with pytest.raises(InputError, match="of another template"):
         load_fit(path, "human")
-    arrays, words = load_file(path), load_words(path)
+    arrays, words = load_file(path), read_fit_header(path)
     header = {"fit": json.dumps({"schema": 1, "fit": words[0], "more": words[1]})}
     for name, bad in {"shape_verts": np.full((9, 3), np.nan), "shape_faces": np.full((4, 3), 10**6)}.items():
         save_file(arrays | {name: bad}, path, header)

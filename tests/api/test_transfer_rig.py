@@ -16,10 +16,10 @@ from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.formats.gltf import Document, digest
+from meshmatch.shapes.formats.gltf_attachments import find_rigid_groups
 from meshmatch.shapes.formats.gltf_edit import Editor
-from meshmatch.shapes.formats.gltf_former import hanging_groups
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
@@ -368,7 +368,7 @@ def test_what_hangs_from_a_joint_goes_with_what_that_moves(tmp_path: Path) -> No
         target, nodes=nodes, meshes=[*json["meshes"], {"primitives": poles}], skins=[{"joints": [1, 2, 3, 5, 4]}]
     )
     V, main = tube().V, weights_of(tube().verts[:, 1]).astype("f4").argmax(axis=1)
-    at_root, at_tip = hanging_groups(Document(target, target.read_bytes()))
+    at_root, at_tip = find_rigid_groups(Document(target, target.read_bytes()))
     assert np.array_equal(at_root[0], np.arange(V)) and not len(at_root[1])
     assert np.array_equal(at_tip[0], np.arange(V, 2 * V)) and np.array_equal(
         at_tip[1] - 2 * V, np.flatnonzero(main == 1)
@@ -552,7 +552,7 @@ def test_a_mesh_of_an_obj_keeps_its_texture(source: Path) -> None:
     bare = rigged(source, plain)[0]
     expected = played(bare, "bend", 1.0)
     uv = np.random.default_rng(0).random((shape.F, 3, 2))
-    save_textured(target, Textured(2 * shape.verts, shape.faces, uv), quarters())
+    save_textured(target, TexturedMesh(2 * shape.verts, shape.faces, uv), quarters())
     with target.open("a") as text:
         text.write("f 1/1 2/2 3/3 4/4\n")
     with pytest.warns(MeshmatchWarning, match=r"^rigged\.glb does not have the polygons of target\.obj$"):

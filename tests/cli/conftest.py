@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.api import matching
-from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.inputs import as_model, repair_or_raise
 from meshmatch.api.results import MatchResult
 from meshmatch.cli import main
 from meshmatch.fitting.fit import Fit
@@ -117,7 +117,7 @@ class FakeMatching:
         self.called = {"shape": shape, "config": matcher.config, "threads": matcher.threads}
         if matcher.progress is not None:
             matcher.progress("orientation", "a.ply", 0.5)
-        notes = tuple(f"{shape.name}: {note}" for note in validated(shape).notes)
+        notes = tuple(f"{shape.name}: {note}" for note in repair_or_raise(shape).notes)
         return [replace(self.make_fit(shape, self.verdict, self.reasons), notes=notes)]
 
 

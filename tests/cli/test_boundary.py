@@ -74,7 +74,7 @@ def fail(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
     def load(path: Path) -> None:
         raise error
 
-    monkeypatch.setattr("meshmatch.shapes.files.mesh_list", load)
+    monkeypatch.setattr("meshmatch.shapes.files.list_meshes", load)
 
 
 def test_a_folder_that_may_not_be_entered_is_an_error_in_a_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +132,7 @@ def load(path):
         os.kill(os.getpid(), signal.SIGTERM)
         Path("cleaned").touch()
 
-files.mesh_list = load
+files.list_meshes = load
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and stays so
 sys.exit(main(["info", "a.ply"]))
 """
@@ -170,7 +170,7 @@ def test_a_second_kill_later_counts(run: Run, monkeypatch: pytest.MonkeyPatch) -
         signal.raise_signal(signal.SIGTERM)
         told.append("not heard")
 
-    monkeypatch.setattr("meshmatch.shapes.files.mesh_list", load)
+    monkeypatch.setattr("meshmatch.shapes.files.list_meshes", load)
     assert run("info", "a.ply").status == 143
     assert told == ["lost"]
 
@@ -199,7 +199,7 @@ def test_what_a_kill_breaks_is_no_bug(run: Run, monkeypatch: pytest.MonkeyPatch,
         except KeyboardInterrupt:
             raise RuntimeError("a worker is gone") from None
 
-    monkeypatch.setattr("meshmatch.shapes.files.mesh_list", load)
+    monkeypatch.setattr("meshmatch.shapes.files.list_meshes", load)
     usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
     before = signal.signal(number, usual)  # a shell lets what runs in its background ignore Ctrl-C
     try:
@@ -219,7 +219,7 @@ def test_the_signal_is_only_borrowed(run: Run, monkeypatch: pytest.MonkeyPatch) 
 
     def own(number: int, frame: object) -> None: ...
 
-    monkeypatch.setattr("meshmatch.shapes.files.mesh_list", load)
+    monkeypatch.setattr("meshmatch.shapes.files.list_meshes", load)
     before = signal.getsignal(signal.SIGTERM)
     try:
         for handler in (signal.SIG_DFL, own, signal.SIG_IGN):

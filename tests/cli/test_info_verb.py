@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import meshmatch
-from meshmatch.collections.settle import SCHEMA
+from meshmatch.collections.select_setting import SCHEMA
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape

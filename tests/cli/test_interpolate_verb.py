@@ -12,7 +12,7 @@ from meshmatch.api import interpolation
 from meshmatch.fitting.fit import Fit
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
@@ -68,7 +68,7 @@ def test_the_mesh_of_a_file_keeps_its_look(run: Run, eggs: Path, tmp_path: Path)
     a = load_shape(eggs / "a.ply")
     uv = np.random.default_rng(0).random((a.F, 3, 2))
     worn = tmp_path / "worn.obj"
-    save_textured(worn, Textured(a.verts, a.faces, uv), quarters())
+    save_textured(worn, TexturedMesh(a.verts, a.faces, uv), quarters())
     call = ("interpolate", worn, eggs / "b.ply", "-n", 2, "--model", eggs / "model", "--quiet", "--threads", 1)
     frames = {kind: tmp_path / kind / f"frame-001.{kind}" for kind in ("obj", "glb", "ply")}
     for kind, frame in frames.items():

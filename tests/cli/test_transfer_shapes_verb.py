@@ -14,7 +14,7 @@ from meshmatch.shapes.blend_shape_files import load_blend_shapes
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_morphs import read_morphs, with_morphs
 from meshmatch.shapes.shape import Shape
@@ -74,7 +74,7 @@ def test_shapes_into_a_glb(run: Run, pair: Path) -> None:
 
 def test_an_obj_keeps_its_texture_in_a_glb(run: Run, pair: Path) -> None:
     b = load_shape("b.ply")
-    save_textured("b.obj", Textured(b.verts, b.faces, np.random.default_rng(0).random((b.F, 3, 2))), quarters())
+    save_textured("b.obj", TexturedMesh(b.verts, b.faces, np.random.default_rng(0).random((b.F, 3, 2))), quarters())
     with Path("b.obj").open("a") as text:
         text.write("f 1/1 2/2 3/3 4/4\n")
     save_map("ab.npz", VertexMap.between(load_shape("a.glb"), load_shape("b.obj"), np.arange(b.V), verdict="good"))

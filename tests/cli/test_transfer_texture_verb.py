@@ -15,7 +15,7 @@ from meshmatch.shapes import dressed_files
 from meshmatch.shapes.appearance import Appearance, png_bytes
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
@@ -42,7 +42,7 @@ def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a textured a.glb, a finer b.ply of the same surface, and a map between them."""
     monkeypatch.chdir(tmp_path)
     ball = icosphere(2)
-    save_textured("a.glb", Textured(ball.verts, ball.faces, unwrapped(ball, 32, 2)), picture())
+    save_textured("a.glb", TexturedMesh(ball.verts, ball.faces, unwrapped(ball, 32, 2)), picture())
     fine, _, _ = split(ball)
     save_shape("b.ply", fine)
     a, b = load_shape("a.glb"), load_shape("b.ply")
@@ -123,7 +123,7 @@ def test_json_says_all_of_it(run: Run, pair: Path) -> None:
 def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pair: Path, uv: str, used: str) -> None:
     b = load_shape("b.ply")
     own = unwrapped(b, 64, 2)[..., ::-1].copy()  # new ones would be the same but for that
-    save_textured("b.glb", Textured(b.verts, b.faces, own), picture())
+    save_textured("b.glb", TexturedMesh(b.verts, b.faces, own), picture())
     save_map("ab2.npz", VertexMap.between(load_shape("a.glb"), load_shape("b.glb"), load_map("ab.npz").index))
     assert told(run(*call(f"--uv {uv} --json", target="b.glb", map="ab2.npz")))["uv"] == used
     found = load_appearance("out.glb", load_shape("out.glb")).uv
@@ -140,7 +140,7 @@ def folded(shape: Shape) -> np.ndarray:
 
 def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) -> None:
     b = load_shape("b.ply")
-    save_textured("b.obj", Textured(b.verts, b.faces, folded(b)), picture())
+    save_textured("b.obj", TexturedMesh(b.verts, b.faces, folded(b)), picture())
     save_map("ab2.npz", replace(load_map("ab.npz"), target_hash=load_shape("b.obj").hash))
     answer = run(*call("--json", target="b.obj", map="ab2.npz"))
     assert told(answer)["uv_note"]
@@ -158,7 +158,7 @@ def test_mirrored_coordinates_are_used_where_both_halves_look_alike(run: Run, pa
     mirrored = folded(b)
     aside = (b.verts[b.faces].mean(axis=1)[:, 0] < 0) * (output == "out.glb")
     laid = mirrored + aside[:, None, None] * [1.0, 0.0]
-    save_textured("b.obj", Textured(b.verts, b.faces, laid), picture())
+    save_textured("b.obj", TexturedMesh(b.verts, b.faces, laid), picture())
     words = ["transfer-texture", "a.ply", "b.obj", "-o", output, "--map", "ab2.npz", *SMALL, "--uv", "keep", "--json"]
     answer = run(*words)
     assert told(answer)["uv"] == "own"
@@ -360,7 +360,7 @@ def wild_coordinates() -> None:
     ball = icosphere(2)
     uv = unwrapped(ball, 32, 2)
     uv[5] = 1e8
-    save_textured("a.glb", Textured(ball.verts, ball.faces, uv), picture())
+    save_textured("a.glb", TexturedMesh(ball.verts, ball.faces, uv), picture())
 
 
 def nothing() -> None:
@@ -420,7 +420,7 @@ def test_a_full_disk_leaves_nothing(run: Run, pair: Path, monkeypatch: pytest.Mo
         raise OSError(28, "No space left on device")
 
     before = {path.name for path in pair.iterdir()}
-    monkeypatch.setattr(dressed_files, "dressed", full)
+    monkeypatch.setattr(dressed_files, "with_material", full)
     refused(run(*call("-q")), "No space left on device", pair, before)
 
 

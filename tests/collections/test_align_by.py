@@ -204,7 +204,7 @@ def test_one_of_thousands_of_meshes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def prepared(count: int) -> Callable[[], dict[str, Any]]:
         held = [(f"bolt {k % count}", 100) for k in range(2 * count)]
-        monkeypatch.setattr(named_parts, "mesh_list", lambda path: held)
+        monkeypatch.setattr(named_parts, "list_meshes", lambda path: held)
         return lambda: parts_of_file("assembly.glb")
 
     masks = grows_with_size(prepared, 2000)

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from meshmatch.collections.atlas import Atlas
-from meshmatch.collections.atlas_files import Findings, record, write_folder
+from meshmatch.collections.atlas_files import AtlasResults, atlas_record, write_folder
 from meshmatch.collections.atlas_pictures import draw_effect, draw_scores
 from meshmatch.collections.measures import Measures, measure_atlas
 from meshmatch.collections.permutation import PlaceTests
@@ -36,7 +36,7 @@ def atlas() -> Atlas:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pictures and charts, which have tests of their own."""
-    for name in ("render_shapes", "draw_beside", "draw_histogram", "draw_scree", "draw_dots"):
+    for name in ("render_shapes", "draw_panels", "draw_histogram", "draw_scree", "draw_dots"):
         monkeypatch.setattr(f"meshmatch.collections.atlas_pictures.{name}", lambda *_, **__: None)
 
 
@@ -65,7 +65,7 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     measures = measure_atlas(atlas, given.points, samples=2)
     comparison = atlas.compare(atlas.names[:4], atlas.names[4:])
     explained = atlas.anova("form ~ log(size)", permutations=20)
-    findings = Findings(measures, comparison, ("thin", "thick"), explained, 2, 7)
+    findings = AtlasResults(measures, comparison, ("thin", "thick"), explained, 2, 7)
     names = write_folder(tmp_path, atlas, findings, rotation=np.eye(3), title="eggs")
     assert names == sorted(path.name for path in tmp_path.iterdir())
     assert np.array_equal(Atlas.load(tmp_path).modes, atlas.modes)
@@ -102,7 +102,7 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     assert [path.name for path in samples] == ["sample-000.ply", "sample-001.ply"]
     assert np.allclose(load_shape(samples[1]).verts, atlas.sample(2, 7)[1].verts)
     told = json.loads((tmp_path / "atlas.json").read_text())
-    assert told == json.loads(json.dumps(record(atlas, findings)))
+    assert told == json.loads(json.dumps(atlas_record(atlas, findings)))
     assert told["groups"]["names"] == ["thin", "thick"]
     assert told["groups"]["labellings"] == 70
     assert told["seed"] == 7
@@ -181,6 +181,6 @@ def test_no_charts_without_matplotlib(tmp_path: Path, atlas: Atlas, monkeypatch:
     monkeypatch.setattr("meshmatch.collections.atlas_files.find_spec", lambda name: None)
     nothing = np.zeros(1)
     empty = Measures(np.ones(1, np.int64), *(7 * [nothing]), 1, 0, 1)
-    names = write_folder(tmp_path, atlas, Findings(empty))
+    names = write_folder(tmp_path, atlas, AtlasResults(empty))
     assert "histogram.png" not in names
     assert "measures.csv" in names

@@ -27,7 +27,7 @@ from meshmatch.fitting.solve.agreement import agree_step
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.locks import locked
-from meshmatch.maps.fit_files import load_words, read_fit, write_fit
+from meshmatch.maps.fit_files import read_fit, read_fit_header, write_fit
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
@@ -274,7 +274,7 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     text = json.dumps(header | {"__metadata__": {"fit": json.dumps(about_fit)}}).encode()
     broken.write_bytes(len(text).to_bytes(8, "little") + text + whole[size:])
     with pytest.raises(InputError, match="not a fit's file"):
-        load_words(broken)
+        read_fit_header(broken)
     broken.write_bytes(whole)
     fit = read_fit(broken, template).fit
     for wrong in (
@@ -290,7 +290,7 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
     assert numbers != whole
     broken.write_bytes(numbers)
     with pytest.raises(InputError, match="schema 9"):
-        load_words(broken)
+        read_fit_header(broken)
     broken.write_bytes(whole)
     other = meshmatch.load_model("quadruped").template
     with pytest.raises(InputError, match="another template"):

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.cli import main
-from meshmatch.collections import settle
+from meshmatch.collections import select_setting
 from meshmatch.experiments.makers import bones
 from meshmatch.fitting import without_model
 from meshmatch.fitting.fit_config import Schedule
@@ -31,10 +31,10 @@ from meshmatch.models.card import read_card
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_add_skeleton import with_skeleton
 from meshmatch.shapes.formats.gltf_rig import Binding, Clip, Rig, Track
-from meshmatch.shapes.formats.gltf_rigged import rigged
 from meshmatch.shapes.landmark_files import read_landmark_file
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
@@ -70,7 +70,7 @@ def write_hero(folder: Path) -> None:
     x, y = ((body.verts[:, k] - low[k]) / (high[k] - low[k]) for k in (0, 1))
     uv = np.stack([x, 1 - y], axis=1)[body.faces]
     plain = folder / "plain.glb"
-    save_textured(plain, Textured(body.verts, body.faces, uv), quarters(64))
+    save_textured(plain, TexturedMesh(body.verts, body.faces, uv), quarters(64))
     above = np.clip(5 * y - 1.5, 0, 1)  # the hips
     weights = np.stack([above, 1 - above], axis=1).astype(np.float32)
     turns = Rotation.from_rotvec(np.sin(np.linspace(0, 2 * np.pi, 9))[:, None] * [0.0, 1, 0]).as_quat()
@@ -84,7 +84,7 @@ def write_hero(folder: Path) -> None:
     seen = cKDTree(body.verts).query(load_shape(plain).verts)[1]
     joints = np.where(weights[seen] > 0, [1, 0], 0).astype(np.int32)
     binding = Binding(rig, rig.worlds(), joints, weights[seen])
-    (folder / "hero.glb").write_bytes(rigged(document, binding)[0])
+    (folder / "hero.glb").write_bytes(with_skeleton(document, binding)[0])
     plain.unlink()
     upper = ((y > 0.5) & (y < 0.8) & (np.abs(x - 0.5) < 0.2))[body.faces].all(axis=1)
     used, faces = np.unique(body.faces[upper], return_inverse=True)
@@ -146,7 +146,7 @@ class _Small(ViscousConfig):
 @pytest.fixture
 def small_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits without a model on few nodes, of few samples: enough for small bones."""
-    for module in (settle, without_model):
+    for module in (select_setting, without_model):
         monkeypatch.setattr(module, "ViscousConfig", _Small)
     monkeypatch.setattr(without_model, "_ALIGN_SAMPLES", 300)
 

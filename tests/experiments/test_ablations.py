@@ -43,7 +43,7 @@ from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.models.registry import load_model
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from meshmatch.templates.template import Template, template_radius

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from meshmatch.experiments.bench import characters
-from meshmatch.experiments.makers.character_designs import Character, people
+from meshmatch.experiments.makers.character_designs import Character, clothed_people
 from meshmatch.generators.proportions import PLAIN
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
@@ -74,7 +74,7 @@ def test_a_pair_that_is_far_off_and_called_good_is_counted(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_people_in_clothes_have_other_triangles_and_a_body_below() -> None:
     pytest.importorskip("anny")
-    first, second = people(read_template("human-T"), 2, PLAIN)
+    first, second = clothed_people(read_template("human-T"), 2, PLAIN)
     for each in (first, second):
         assert len(each.bones) == len(each.places) == each.shape.V and each.places.max() < each.body.V
         away = np.linalg.norm(each.body.verts[each.places] - each.shape.verts, axis=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshmatch.experiments.makers.character_designs import places_on, touching
+from meshmatch.experiments.makers.character_designs import people_in_contact, places_on
 from meshmatch.experiments.makers.contact_poses import POSES, contact_depths, contact_poses, far_neighbours, skin_points
 from meshmatch.experiments.makers.fused_surface import fused_surface, occupied
 from meshmatch.generators.bodies import draw_identities, template_rig
@@ -98,7 +98,7 @@ def test_hands_lie_on_what_they_are_to_touch_and_not_in_it() -> None:
 def test_people_touch_themselves_and_their_fused_surface_has_places_on_the_body() -> None:
     pytest.importorskip("anny")
     template = read_template("human-T")
-    plain, fused = (touching(template, 2, 0, "x", each) for each in (False, True))
+    plain, fused = (people_in_contact(template, 2, 0, "x", each) for each in (False, True))
     assert list(POSES)[1] == "hands on the face"
     for loose, one in zip(plain, fused, strict=True):
         assert np.array_equal(loose.body.verts, one.body.verts)

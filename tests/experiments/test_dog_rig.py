@@ -13,7 +13,7 @@ from meshmatch.experiments.makers import dog_rig
 from meshmatch.experiments.makers.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import AnimalRig, load_rig
 from meshmatch.generators.quadrupeds import resting_animal
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, make_template
 from tests.generators.animal_rigs import check_rig

@@ -11,7 +11,7 @@ import pytest
 from meshmatch.experiments.bench import partial
 from meshmatch.experiments.bench.partial import main, part_of, seen_faces
 from meshmatch.experiments.bench.sets import load_set
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -25,11 +25,11 @@ def test_a_camera_sees_what_faces_it_and_is_not_hidden() -> None:
     )
     centers = behind.verts[behind.faces].mean(axis=1)
     seen = seen_faces(behind, centers, np.array([0.0, 0.0, 1.0]))
-    front = unit(behind.face_vectors)[:, 2] > 0
+    front = normalized(behind.face_vectors)[:, 2] > 0
     assert np.array_equal(seen[: ball.F], front[: ball.F])
     assert not seen[ball.F :].any()  # the small ball stands in the shadow of the large one
     aside = seen_faces(behind, centers, np.array([1.0, 0.0, 0.0]))
-    assert np.array_equal(aside, unit(behind.face_vectors)[:, 0] > 0)
+    assert np.array_equal(aside, normalized(behind.face_vectors)[:, 0] > 0)
 
 
 @pytest.mark.parametrize("kind", partial.KINDS)

@@ -11,15 +11,15 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.runner import (
     Report,
     Seed,
+    cached,
     command,
     commit,
-    names_of,
-    once,
-    plain,
+    evenly_spread,
     read_cached,
-    spread,
+    split_names,
     table,
     table_cells,
+    to_json,
     write_cached,
 )
 
@@ -61,15 +61,15 @@ def test_a_bug_keeps_its_traceback() -> None:
 
 
 def test_names_are_checked_and_items_are_spread() -> None:
-    assert names_of("b,a,b", "abc", "letter") == ["b", "a"]
-    assert names_of("", "abc", "letter") == []
+    assert split_names("b,a,b", "abc", "letter") == ["b", "a"]
+    assert split_names("", "abc", "letter") == []
     with pytest.raises(OptionError, match="unknown letter 'd'"):
-        names_of("a,d", "abc", "letter")
+        split_names("a,d", "abc", "letter")
     items = list(range(10))
-    assert spread(items, None) == spread(items, 99) == items
-    assert spread(items, 2) == [0, 9]
-    assert len(set(spread(items, 4))) == 4
-    assert spread(items, 0) == [0]
+    assert evenly_spread(items, None) == evenly_spread(items, 99) == items
+    assert evenly_spread(items, 2) == [0, 9]
+    assert len(set(evenly_spread(items, 4))) == 4
+    assert evenly_spread(items, 0) == [0]
 
 
 def test_a_table_as_words() -> None:
@@ -89,7 +89,7 @@ def test_a_saved_run_has_its_command_and_its_tables(tmp_path: Path) -> None:
 
 
 def test_plain_values() -> None:
-    found = plain({"a": (1, Path("b")), 2: np.float32(0.5), "c": np.int64(3), "d": True, "e": np.inf})
+    found = to_json({"a": (1, Path("b")), 2: np.float32(0.5), "c": np.int64(3), "d": True, "e": np.inf})
     assert found == {"a": [1, "b"], "2": 0.5, "c": 3, "d": True, "e": None}
 
 
@@ -103,7 +103,7 @@ def test_a_result_is_measured_once(tmp_path: Path) -> None:
     path = tmp_path / "new" / "run.json"
     asked = {"pairs": (("a", "b"),), "seed": 0}
     assert read_cached(path, asked) is None
-    assert once(path, asked, measure) == once(path, asked, measure) == read_cached(path, asked)
+    assert cached(path, asked, measure) == cached(path, asked, measure) == read_cached(path, asked)
     assert len(calls) == 1
 
 
@@ -124,4 +124,4 @@ def test_a_damaged_result_is_told(words: str, tmp_path: Path) -> None:
 
 def test_commit_without_git(tmp_path: Path) -> None:
     assert commit(tmp_path) == "unknown"
-    assert runner.circumstances(2)["threads"] == 2
+    assert runner.run_metadata(2)["threads"] == 2

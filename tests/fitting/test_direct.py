@@ -27,9 +27,9 @@ from meshmatch.fitting.solve.surface_nodes import SurfaceNodes
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.progress import Progress
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import apart, mirrored
+from meshmatch.templates.mirror_images import alignment_residuals, mirrored
 
 QUICK = DirectConfig(coarse=900, fine=1800, samples=2500, second_samples=1000, first_samples=600, n_second=6, n_third=3)
 # limbs of a creature: where they point, how long and how wide they are
@@ -286,7 +286,7 @@ def test_a_mirror_image_is_found_where_it_fits_clearly_better() -> None:
     plain = Shape(turn.apply(np.array(source.verts)), source.faces, "turned")
     target = mirrored(plain)
     for other, nearer in ((plain, False), (target, True)):
-        same, image = apart(source, other, 0)
+        same, image = alignment_residuals(source, other, 0)
         assert (image < 0.6 * same) is nearer
     finer = replace(QUICK, fine=5000, samples=8000, n_second=4, n_third=2)
     found = match_either_side(source, target, finer, known=(source.verts[:3], target.verts[:3])).target
@@ -302,10 +302,10 @@ def test_a_guess_is_much_the_same_as_what_is_found_or_its_energy_is_known(pair: 
     rng = np.random.default_rng(0)
     for right, goals in ((True, target.verts), (False, rng.permutation(target.verts))):
         found = match_directly(source, target, QUICK, guess=(source.verts, goals))
-        assert found.over_guess == 0 if right else found.over_guess > 0.01
-    assert dict(found.tried)["guess"] == pytest.approx(found.energy + found.over_guess)
+        assert found.guess_lead == 0 if right else found.guess_lead > 0.01
+    assert dict(found.tried)["guess"] == pytest.approx(found.energy + found.guess_lead)
     both = match_directly(source, target, replace(QUICK, both_ways="always", n_returned=1), guess=(source.verts, goals))
-    assert both.before is not None and 0.01 < both.over_guess < np.inf
+    assert both.before is not None and 0.01 < both.guess_lead < np.inf
 
 
 def test_a_heavy_mesh_is_matched_by_a_lighter_one(pair: tuple[Shape, Shape], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -408,7 +408,7 @@ def test_a_palm_on_the_back_of_a_hand_asks_for_the_mirror_image(
     nearer: float, apart: float, alike: float, asked: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = curled()
-    monkeypatch.setattr("meshmatch.fitting.direct.apart", lambda *_: (apart * np.exp(nearer), apart))
+    monkeypatch.setattr("meshmatch.fitting.direct.alignment_residuals", lambda *_: (apart * np.exp(nearer), apart))
     monkeypatch.setattr(SimplifiedMesh, "likeness", lambda *_: alike)
     found = match_either_side(source, mirrored(source), replace(QUICK, n_second=4, n_third=2, both_ways="no"))
     assert found.target.frame.mirrored is asked

@@ -90,7 +90,7 @@ def test_what_fits_either_way_is_not_called_good(monkeypatch: pytest.MonkeyPatch
 
 def test_what_is_whole_on_one_side_is_no_part_on_the_other(one_sided: None, monkeypatch: pytest.MonkeyPatch) -> None:
     tried = []
-    monkeypatch.setattr(fitter, "_may_be_part", lambda whole: tried.append(whole.core_frame.mirrored))
+    monkeypatch.setattr(fitter, "_part_is_plausible", lambda whole: tried.append(whole.core_frame.mirrored))
     meshmatch.register(DANCER, model="human", config=FitConfig(mirror="auto"))
     assert tried == [True]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.api.inputs import validated
+from meshmatch.api.inputs import repair_or_raise
 from meshmatch.api.matching import register
 from meshmatch.errors import InputError
 from meshmatch.fitting.fit_config import FitConfig
@@ -135,7 +135,7 @@ def test_a_tenth_of_strays_changes_little_and_nine_tenths_are_told() -> None:
     assert rough.verdict != "poor" and not rough.partial
     apart = np.linalg.norm(rough.points_in_file - clean.points_in_file, axis=1)
     assert apart.mean() < 4  # centimetres
-    assert len(rough.vertex_distance) == validated(Shape(with_strays, NO_FACES)).shape.V > 950
+    assert len(rough.vertex_distance) == repair_or_raise(Shape(with_strays, NO_FACES)).shape.V > 950
     nowhere = Shape(np.concatenate([points[:100], around(points, 900)]), NO_FACES)
     lost = register(nowhere, config=replace(FEW, partial="no"))
     assert lost.verdict == "poor" and lost.reasons

@@ -25,7 +25,7 @@ from meshmatch.fitting.search.task import FitTask, Registration, take_samples
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.geometry.frames import RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import repair
@@ -83,7 +83,7 @@ def test_what_is_not_visible_is_not_held_against_a_part() -> None:
 
 def side_of(body: Shape, direction: np.ndarray) -> tuple[Shape, np.ndarray]:
     """The faces that look one way, as a mesh of their own, and which vertices it kept."""
-    faces = body.faces[unit(body.face_vectors) @ direction > 0]
+    faces = body.faces[normalized(body.face_vectors) @ direction > 0]
     used = np.unique(faces)
     return Shape(body.verts[used], np.searchsorted(used, faces), "side"), used
 
@@ -134,7 +134,7 @@ def test_what_is_said_to_be_a_part_is_tried_as_a_whole_with_little_effort(
 
     usual = fitted("no")
     monkeypatch.setattr(fitter, "fit_whole", counted)
-    monkeypatch.setattr(fitter, "_may_be_part", lambda whole: part)
+    monkeypatch.setattr(fitter, "_part_is_plausible", lambda whole: part)
     monkeypatch.setattr(fitter, "_as_part_if_better", lambda whole: (whole, True))
     found = fitted("yes")
     assert found.partial == part
@@ -156,7 +156,7 @@ def test_a_character_of_open_parts_is_tried_as_a_part_of_a_body_only_in_a_long_s
     whole = SimpleNamespace(
         task=task, candidate=SimpleNamespace(residual=0.05), local=None, surface=SimpleNamespace(points=0)
     )
-    assert fitter._may_be_part(whole) is tried  # type: ignore[arg-type]
+    assert fitter._part_is_plausible(whole) is tried  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from meshmatch.api.inputs import validated
+from meshmatch.api.inputs import repair_or_raise
 from meshmatch.errors import InputError
 from meshmatch.fitting.agree import agreed_fits
 from meshmatch.fitting.fit_config import FitConfig
@@ -31,7 +31,7 @@ def test_samples_have_the_weights_of_where_they_lie(sphere: Shape, cloud: bool) 
     height = 0.5 + 0.5 * sphere.verts[:, 2]
     verts = np.concatenate([sphere.verts, [[9.0, 9, 9]]])  # which repair drops
     shape = Shape(verts, NO_FACES if cloud else sphere.faces, weights=np.append(height, 1))
-    samples = sample_surface(validated(shape).shape, 300, np.random.default_rng(0))
+    samples = sample_surface(repair_or_raise(shape).shape, 300, np.random.default_rng(0))
     assert samples.weights is not None
     assert np.abs(samples.weights - (0.5 + 0.5 * samples.points[:, 2])).max() < 1e-7  # single precision
     assert samples.signed == (not cloud)

@@ -12,7 +12,7 @@ from meshmatch.experiments.makers.molars_and_leaves import leaves
 from meshmatch.fitting import without_model
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.judge.direct import DirectFeatures
-from meshmatch.fitting.kind_templates import finest, mean_shape, template_of, viscous_system
+from meshmatch.fitting.kind_templates import mean_shape, template_of, viscous_system, with_final_nodes
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import RimTerm
 from meshmatch.fitting.solve.viscous import ViscousConfig
@@ -20,10 +20,10 @@ from meshmatch.fitting.without_model import fit_without_model
 from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.rims import RimPoints
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import mirrored
+from meshmatch.templates.mirror_images import mirrored
 from meshmatch.templates.template import Template
 from tests.fitting.test_direct import QUICK, bent, creature
 from tests.shapes.test_rims import disc
@@ -124,11 +124,11 @@ def test_a_template_that_would_fold_is_held(template: Template) -> None:
 
 
 def test_last_fits_have_more_nodes_but_of_sheets(template: Template) -> None:
-    fine, few = finest(template, CONFIG), len(template.nodes)
+    fine, few = with_final_nodes(template, CONFIG), len(template.nodes)
     assert len(fine.nodes) == round(5 / 3 * few) and np.allclose(fine.shape.verts, template.shape.verts)
     assert fine.hash != template.hash
     sheet = template_of(disc(count=1000), "sheet", CONFIG)
-    assert finest(sheet, CONFIG) is sheet
+    assert with_final_nodes(sheet, CONFIG) is sheet
 
 
 def test_the_mean_of_poses_keeps_the_size_of_what_turns(template: Template) -> None:

@@ -8,7 +8,7 @@ import torch
 from meshmatch.errors import OptionError
 from meshmatch.generators.bodies import Bodies, sample_bodies
 from meshmatch.generators.characters import CharacterConfig, sample_characters, sample_layers, sample_rest_poses
-from meshmatch.generators.clothes import dressed, skirted
+from meshmatch.generators.clothes import add_clothes, add_skirts
 from meshmatch.generators.figure import PARTS, Figure, joints_of, part
 from meshmatch.generators.proportions import (
     BUILT,
@@ -19,9 +19,9 @@ from meshmatch.generators.proportions import (
     TOON,
     Style,
     draw_style,
-    rounded,
+    round_parts,
+    scale_bones,
     shares_with_stylised,
-    stretched,
 )
 from meshmatch.generators.rig import Rig, forward_kinematics
 from tests.generators.stick import seeded, stick_figure
@@ -74,7 +74,7 @@ def test_axes_are_right_handed_and_along_the_bones(figure: Figure) -> None:
 def test_sizes_of_one_change_nothing(figure: Figure) -> None:
     rest, heads = resting(figure)
     plain = Style(torch.zeros(2, dtype=torch.long), torch.ones(2, len(PARTS), 3))
-    verts, joints = stretched(figure, rest, heads, plain)
+    verts, joints = scale_bones(figure, rest, heads, plain)
     assert torch.allclose(verts, rest, atol=1e-5)
     assert torch.allclose(joints, heads, atol=1e-5)
 
@@ -84,7 +84,7 @@ def test_a_longer_thigh_lowers_what_hangs_on_it_and_a_larger_head_stays_in_place
     sizes = torch.ones(1, len(PARTS), 3)
     sizes[:, [part("thigh", "L"), part("thigh", "R")], 1] = 1.5
     sizes[:, part("head")] = 2.0
-    verts, joints = stretched(figure, rest, heads, Style(torch.zeros(1, dtype=torch.long), sizes))
+    verts, joints = scale_bones(figure, rest, heads, Style(torch.zeros(1, dtype=torch.long), sizes))
     for side in ("L", "R"):
         hip, knee, foot = (joint(figure, f"{name}.{side}") for name in ("upperleg01", "lowerleg01", "foot"))
         before, after = heads[0, knee] - heads[0, hip], joints[0, knee] - joints[0, hip]
@@ -111,7 +111,7 @@ def test_styles_are_alike_on_both_sides_and_stylised_heads_are_large() -> None:
 def test_rounded_parts_lie_nearer_to_balls(figure: Figure) -> None:
     rest, heads = resting(figure, 64)
     own = rows_of(figure, "hand L")
-    moved = rounded(figure, rest, heads, torch.full((64,), BUILT), seeded())
+    moved = round_parts(figure, rest, heads, torch.full((64,), BUILT), seeded())
 
     def roundness(verts: torch.Tensor) -> torch.Tensor:
         radius = (verts[:, own] - verts[:, own].mean(1, keepdim=True)).norm(dim=-1)
@@ -129,7 +129,7 @@ def test_solids_are_wide_or_narrow_deep_or_flat(figure: Figure) -> None:
         width, depth = verts[:, own, 0].std(1), verts[:, own, 2].std(1)
         return float((width / depth).log().std())
 
-    built, plain = (rounded(figure, rest, heads, torch.full((64,), kind), seeded()) for kind in (BUILT, PLAIN))
+    built, plain = (round_parts(figure, rest, heads, torch.full((64,), kind), seeded()) for kind in (BUILT, PLAIN))
     assert variety(built) > 0.12 > 3 * variety(plain)
 
 
@@ -138,7 +138,7 @@ def test_solids_are_wide_or_narrow_deep_or_flat(figure: Figure) -> None:
 
 def test_clothes_are_worn_outside(figure: Figure) -> None:
     rest, heads = resting(figure, 32)
-    clothed = dressed(figure, rest, heads, seeded())
+    clothed = add_clothes(figure, rest, heads, seeded())
     assert torch.isfinite(clothed).all()
     own = rows_of(figure, "shin L")  # small closed pieces: outside is away from their middles
     pieces = [x[:, own].unflatten(1, (-1, 4)) for x in (rest, clothed)]
@@ -173,7 +173,7 @@ def legs(spread: float) -> tuple[Figure, torch.Tensor, torch.Tensor]:
 def test_skirts_close_between_legs_that_are_together_and_leave_a_split_alone() -> None:
     figure, verts, joints = legs(0.0)
     heads = figure.rig.heads.repeat(16, 1, 1)
-    moved = skirted(figure, verts, heads, joints, seeded())
+    moved = add_skirts(figure, verts, heads, joints, seeded())
     ring = slice(-48, -24)  # around the left thigh, at x > 0
     before, after = verts[:, ring], moved[:, ring]
     front = before[..., 2] > before[..., 2].mean(1, keepdim=True) + 0.02
@@ -188,7 +188,7 @@ def test_skirts_close_between_legs_that_are_together_and_leave_a_split_alone() -
         others[rows_of(figure, name)] = False
     assert torch.equal(moved[:, others], verts[:, others])
     figure, verts, joints = legs(0.6)
-    assert torch.equal(skirted(figure, verts, heads, joints, seeded()), verts)
+    assert torch.equal(add_skirts(figure, verts, heads, joints, seeded()), verts)
 
 
 # people

@@ -6,7 +6,7 @@ from scipy.spatial import Delaunay
 from trimesh.creation import cylinder, icosphere
 
 from meshmatch.arrays import Floats, Ints
-from meshmatch.geometry.disks import Disk, _squared_stretch, found_in, mean_values, patches
+from meshmatch.geometry.disks import Disk, _squared_stretch, edge_connected_patches, locate_points, mean_values
 
 BALL = icosphere(4)
 
@@ -80,13 +80,13 @@ def test_what_is_no_disk() -> None:
 def test_holes_are_closed_within_the_zone() -> None:
     middle = BALL.vertices[BALL.faces].mean(axis=1)
     ring, zone = (middle[:, 2] > 0.2) & (middle[:, 2] < 0.9), middle[:, 2] > 0.0
-    (found,) = patches(BALL.faces, ring, zone)
+    (found,) = edge_connected_patches(BALL.faces, ring, zone)
     assert set(found) == set(np.flatnonzero(middle[:, 2] > 0.2))
-    (alone,) = patches(BALL.faces, ring, ring)
+    (alone,) = edge_connected_patches(BALL.faces, ring, ring)
     assert set(alone) == set(np.flatnonzero(ring))
     ends = np.abs(middle[:, 2]) > 0.9
-    assert sorted(len(each) for each in patches(BALL.faces, ends, ends)) == [ends.sum() // 2] * 2
-    assert patches(BALL.faces, np.zeros(len(middle), bool), np.zeros(len(middle), bool)) == []
+    assert sorted(len(each) for each in edge_connected_patches(BALL.faces, ends, ends)) == [ends.sum() // 2] * 2
+    assert edge_connected_patches(BALL.faces, np.zeros(len(middle), bool), np.zeros(len(middle), bool)) == []
 
 
 def test_points_are_found_where_they_lie() -> None:
@@ -96,9 +96,9 @@ def test_points_are_found_where_they_lie() -> None:
     weights = rng.dirichlet(np.ones(3), 100)
     face = rng.integers(0, len(corners), 100)
     points = (places[corners[face]] * weights[:, :, None]).sum(axis=1)
-    found, at, inside = found_in(places, corners, points)
+    found, at, inside = locate_points(places, corners, points)
     assert inside.all()
-    assert not found_in(places, corners, points + 2)[2].any()
+    assert not locate_points(places, corners, points + 2)[2].any()
     np.testing.assert_allclose((places[corners[found]] * at[:, :, None]).sum(axis=1), points, atol=1e-9)
     assert at.min() >= 0 and (found == face).mean() > 0.95
 

@@ -12,12 +12,12 @@ from meshmatch.geometry.oriented import (
     NORMAL_WEIGHT,
     OrientedPoints,
     feature_tree,
-    nearest,
+    nearest_by_brute_force,
     nearest_unsigned,
     quick_tree,
     with_normals,
 )
-from meshmatch.geometry.triangles import edge_lengths, is_discontinuous, unit
+from meshmatch.geometry.triangles import edge_lengths, is_discontinuous, normalized
 
 
 def ball(signed: bool = True) -> OrientedPoints:
@@ -72,8 +72,8 @@ def test_images_far_apart_of_near_neighbours_are_discontinuous() -> None:
 def test_normals_without_a_sign_are_compared_both_ways() -> None:
     """What is found in groups is what two searches of all points find."""
     rng = np.random.default_rng(0)
-    points, normals = rng.random((500, 3)), unit(rng.standard_normal((500, 3)))
-    tree = OrientedPoints(rng.random((300, 3)), unit(rng.standard_normal((300, 3)))).tree
+    points, normals = rng.random((500, 3)), normalized(rng.standard_normal((500, 3)))
+    tree = OrientedPoints(rng.random((300, 3)), normalized(rng.standard_normal((300, 3)))).tree
     both = [tree.query(with_normals(points, sign * normals), distance_upper_bound=0.2) for sign in (1, -1)]
     distance, index, turned = nearest_unsigned(tree, points, normals, 0.2)
     assert np.array_equal(distance, np.minimum(both[0][0], both[1][0]))
@@ -89,7 +89,7 @@ def test_comparing_all_with_all_answers_as_a_tree_does_up_to_rounding(P: int, Q:
     points, queries = (rng.normal(size=(count, D)) + 100 for count in (P, Q))
     queries[::2] = 9 * (queries[::2] - 100) + 100  # far away
     distance, expected = quick_tree(points).query(queries)
-    found = nearest(points, queries)
+    found = nearest_by_brute_force(points, queries)
     assert np.allclose(np.linalg.norm(points[found] - queries, axis=1), distance, rtol=1e-5)
     assert (found != expected).mean() < 0.001
 

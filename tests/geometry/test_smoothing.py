@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import spsolve
 
-from meshmatch.geometry.smoothing import averaged, laplacian, solved
+from meshmatch.geometry.smoothing import laplacian, smooth_values, solve_positive_definite
 
 
 def strip(width: int, length: int) -> np.ndarray:
@@ -22,7 +22,7 @@ def test_large_systems_are_solved() -> None:
     edges, V = strip(16, 1500), 16 * 1500
     matrix = (laplacian(edges, np.full(len(edges), 1e5), V) + diags_array(np.ones(V))).tocsr()
     right = np.random.default_rng(0).normal(size=(V, 1)) + (np.arange(V) > V / 2)[:, None]
-    found = solved(matrix, right, right)
+    found = solve_positive_definite(matrix, right, right)
     assert np.linalg.norm(matrix @ found - right) <= 1.01e-6 * np.linalg.norm(right)
     assert np.allclose(found[:, 0], spsolve(csc_array(matrix), right[:, 0]), atol=1e-3)
 
@@ -35,7 +35,7 @@ def test_vertices_with_many_neighbours_take_little_memory(hubs: int) -> None:
     matrix = (laplacian(edges, np.ones(len(edges)), V) + diags_array(np.ones(V))).tocsr()
     right = np.random.default_rng(0).normal(size=(V, 1))
     tracemalloc.start()
-    found = solved(matrix, right, right)
+    found = solve_positive_definite(matrix, right, right)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6
@@ -45,4 +45,4 @@ def test_vertices_with_many_neighbours_take_little_memory(hubs: int) -> None:
 def test_separate_vertices_keep_their_values() -> None:
     values = np.random.default_rng(0).normal(size=(30_000, 2))
     edges = np.zeros((0, 2), dtype=np.int64)
-    assert np.allclose(averaged(values, np.ones(30_000), edges, np.zeros(0), 1.0), values)
+    assert np.allclose(smooth_values(values, np.ones(30_000), edges, np.zeros(0), 1.0), values)

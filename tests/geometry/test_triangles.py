@@ -11,10 +11,10 @@ from meshmatch.geometry.triangles import (
     cross_product,
     dot,
     interpolate,
+    normalized,
     squared_lengths,
     triangle_areas,
     triangle_vectors,
-    unit,
     vertex_areas,
     vertex_normals,
 )
@@ -26,7 +26,7 @@ FACES = np.array([[0, 1, 2], [1, 0, 3]])
 
 def test_areas_and_normals_by_hand() -> None:
     assert np.allclose(triangle_areas(VERTS, FACES), [2, 6])
-    assert np.allclose(unit(triangle_vectors(VERTS, FACES)), [[0, 0, 1], [0, -1, 0]])
+    assert np.allclose(normalized(triangle_vectors(VERTS, FACES)), [[0, 0, 1], [0, -1, 0]])
     assert np.allclose(vertex_areas(VERTS, FACES), [8 / 3, 8 / 3, 2 / 3, 2])
     mean = np.array([0.0, -3, 1]) / np.sqrt(10)  # area-weighted
     assert np.allclose(vertex_normals(VERTS, FACES), [mean, mean, [0, 0, 1], [0, -1, 0]])
@@ -34,7 +34,7 @@ def test_areas_and_normals_by_hand() -> None:
 
 def test_a_flat_triangle_and_a_lone_vertex_have_no_normal() -> None:
     verts = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 9, 9]])
-    assert not unit(triangle_vectors(verts, np.array([[0, 1, 2]]))).any()
+    assert not normalized(triangle_vectors(verts, np.array([[0, 1, 2]]))).any()
     assert not vertex_normals(verts, np.array([[0, 1, 2]])).any()
     assert vertex_areas(verts, np.array([[0, 1, 2]])).tolist() == [0, 0, 0, 0]
 

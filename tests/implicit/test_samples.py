@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.implicit.samples import FAR, FILLED, read_implicit_samples, samples_of
+from meshmatch.implicit.samples import FAR, FILLED, read_implicit_samples, sample_shape
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -68,9 +68,9 @@ def test_clouds_and_given_distances(tmp_path: Path) -> None:
 def test_a_mesh_with_a_hole_may_be_taken_as_a_surface() -> None:
     whole = box(HALF)
     open_one = Shape(whole.verts, whole.faces[1:])
-    rows = samples_of(open_one, 400, np.random.default_rng(0), closed=False)[1]
+    rows = sample_shape(open_one, 400, np.random.default_rng(0), closed=False)[1]
     assert np.isnan(rows[200:, 3]).all()
-    solid = samples_of(whole, 400, np.random.default_rng(0), closed=False)[1]
+    solid = sample_shape(whole, 400, np.random.default_rng(0), closed=False)[1]
     assert (solid[200:, 3] < 0).any()
 
 

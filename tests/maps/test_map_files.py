@@ -183,7 +183,7 @@ def test_a_map_that_promises_more_than_it_holds(tmp_path: Path, suffix: str) -> 
 def test_text_that_would_take_too_much_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes
 ) -> None:
-    monkeypatch.setattr(input_files, "ROOM", 100_000)
+    monkeypatch.setattr(input_files, "MEMORY_ALLOWANCE", 100_000)
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=rf"^{name} promises too much"):
         load_map(tmp_path / name)
@@ -200,7 +200,7 @@ def test_arrays_that_would_take_too_much_memory(tmp_path: Path, monkeypatch: pyt
     else:
         savemat(path, {"index": index})
     load_map(path)
-    monkeypatch.setattr(input_files, "ROOM", 60_000)
+    monkeypatch.setattr(input_files, "MEMORY_ALLOWANCE", 60_000)
     with pytest.raises(InputError, match="promises too much"):
         load_map(path)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshmatch.maps.build import build_map
-from meshmatch.maps.parts import kept_together
+from meshmatch.maps.parts import match_parts
 from meshmatch.maps.places import Places
 from tests.conftest import icosphere
 
@@ -60,7 +60,7 @@ def test_one_skin_with_little_beside_it_has_no_parts(lengths: tuple[float, ...])
     whole, built = beads(*lengths)[0], beads(1, 1, 1, 1, 1, shift=0.3)[0]
     for source, target in ((whole, built), (built, whole)):
         alone = target.nearest(source.resting)
-        assert kept_together(source, target, alone) is alone
+        assert match_parts(source, target, alone) is alone
 
 
 def test_parts_that_were_not_fitted_are_no_counterparts() -> None:

@@ -9,9 +9,9 @@ from meshmatch.arrays import Ints
 from meshmatch.geometry.disks import Disk
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.folds import Folds
+from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import MappedMesh, invert_map
-from meshmatch.maps.named_places import corners_of
-from meshmatch.maps.unfold import _Images, _ratios, unfolded, unfolded_both_ways
+from meshmatch.maps.unfold import _Images, _ratios, unfold, unfold_both_ways
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 
@@ -46,7 +46,7 @@ def pulled(source: Shape, moved: Ints) -> np.ndarray:
 def test_folds_are_opened_and_the_rest_stays() -> None:
     source, target = ball(3), ball(3, 0.0)
     before = folded(source, target)
-    after = unfolded(before, source, target)
+    after = unfold(before, source, target)
     assert Folds.of(before, source, target).flipped > 0.003
     assert Folds.of(after, source, target) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
     far = np.linalg.norm(source.verts[:, None] - source.verts[MOVED], axis=2).min(axis=1) > 0.8
@@ -59,7 +59,7 @@ def test_folds_are_opened_and_the_rest_stays() -> None:
 
 def test_both_ways_are_inverse_and_have_no_folds() -> None:
     source, target = ball(3), ball(3, 0.0)
-    there, back = unfolded_both_ways(folded(source, target), put(target, source, target.verts), source, target)
+    there, back = unfold_both_ways(folded(source, target), put(target, source, target.verts), source, target)
     for found, one, other in ((there, source, target), (back, target, source)):
         assert Folds.of(found, one, other) == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))
     assert missed(there, back, source, target) < 0.05
@@ -103,8 +103,8 @@ def test_both_ways_are_the_same_in_either_order_however_a_file_stands_and_is_cut
     near = np.linalg.norm(source.verts - place, axis=1, keepdims=True) < 0.3
     crushed = np.where(near, place + 0.02 * (source.verts - place), source.verts)  # beside its middle nothing is sound
     found, back = put(source, target, crushed), put(target, source, target.verts)
-    there, again = unfolded_both_ways(found, back, source, target)
-    swapped = unfolded_both_ways(back, found, target, source)
+    there, again = unfold_both_ways(found, back, source, target)
+    swapped = unfold_both_ways(back, found, target, source)
     for one, other in zip((again, there), swapped, strict=True):
         np.testing.assert_array_equal(one.face, other.face)
         np.testing.assert_array_equal(one.barycentric, other.barycentric)
@@ -115,7 +115,7 @@ def test_both_ways_are_the_same_in_either_order_however_a_file_stands_and_is_cut
     onto = VertexMap.between(source, cut, 3 * found.face + found.barycentric.argmax(1), **rest)
     rest = {name: getattr(back, name)[corner] for name in ("face", "barycentric", "confidence")}
     off = VertexMap.between(cut, source, back.index[corner], **rest)
-    there_cut, again_cut = unfolded_both_ways(onto, off, source, cut)
+    there_cut, again_cut = unfold_both_ways(onto, off, source, cut)
     np.testing.assert_allclose(there_cut.points(cut), 2 * there.points(target) @ turn.T, atol=1e-9)
     np.testing.assert_allclose(again_cut.points(source), again.points(source)[corner], atol=1e-9)
 
@@ -124,8 +124,8 @@ def test_a_shape_and_its_mirror_image_have_one_pair_of_maps() -> None:
     source, target = ball(3), ball(3)
     target = Shape(target.verts * [-1, 1, 1], target.faces[:, ::-1])
     found, back = put(source, target, source.verts), put(target, source, target.verts)
-    there, again = unfolded_both_ways(found, back, source, target)
-    for one, other in zip((again, there), unfolded_both_ways(back, found, target, source), strict=True):
+    there, again = unfold_both_ways(found, back, source, target)
+    for one, other in zip((again, there), unfold_both_ways(back, found, target, source), strict=True):
         np.testing.assert_array_equal(one.barycentric, other.barycentric)
 
 
@@ -140,7 +140,7 @@ def test_parts_that_touch_stay_apart() -> None:
         VertexMap.between(one, other, np.arange(one.V), confidence=np.ones(one.V))
         for one, other in ((source, target), (target, source))
     )
-    for one, other in zip(unfolded_both_ways(found, back, source, target), (target, source), strict=True):
+    for one, other in zip(unfold_both_ways(found, back, source, target), (target, source), strict=True):
         off = np.linalg.norm(one.points(other) - other.verts, axis=1)
         inside = (np.abs(part.vertices) < 0.5).sum(axis=1) > 1  # at the rim of the wall normals do not tell parts apart
         assert (off[np.tile(inside, 2)] < 1e-6).all()
@@ -162,7 +162,7 @@ def missed(there: VertexMap, back: VertexMap, source: Shape, target: Shape) -> f
 def test_a_map_without_folds_is_the_same() -> None:
     source, target = ball(3), ball(2)
     found = put(source, target, source.verts)
-    assert unfolded(found, source, target) is found
+    assert unfold(found, source, target) is found
 
 
 def test_a_mirror_image_is_no_fold() -> None:
@@ -171,7 +171,7 @@ def test_a_mirror_image_is_no_fold() -> None:
     before = folded(source, target)
     found = VertexMap.between(source, mirrored, before.index, confidence=before.confidence)
     assert 0.003 < Folds.of(found, source, mirrored).flipped < 0.1
-    assert Folds.of(unfolded(found, source, mirrored), source, mirrored).flipped == 0
+    assert Folds.of(unfold(found, source, mirrored), source, mirrored).flipped == 0
 
 
 def test_vertices_at_one_place_move_together() -> None:
@@ -182,8 +182,8 @@ def test_vertices_at_one_place_move_together() -> None:
     before = folded(source, target)
     rest = {name: np.concatenate([getattr(before, name)] * 2) for name in ("face", "barycentric", "confidence")}
     found = VertexMap.between(doubled, target, np.tile(before.index, 2), **rest)
-    points, used = unfolded(found, doubled, target).points(target), np.unique(doubled.faces)
-    right = np.tile(unfolded(before, source, target).points(target), (2, 1))
+    points, used = unfold(found, doubled, target).points(target), np.unique(doubled.faces)
+    right = np.tile(unfold(before, source, target).points(target), (2, 1))
     np.testing.assert_allclose(points[used], right[used], atol=1e-6)
 
 
@@ -192,17 +192,17 @@ def test_what_it_does_not_touch() -> None:
     found = folded(source, target)
     cloud = Shape(source.verts, np.zeros((0, 3), int))
     of_cloud = VertexMap.between(cloud, target, found.index)
-    assert unfolded(of_cloud, cloud, target) is of_cloud
+    assert unfold(of_cloud, cloud, target) is of_cloud
     rng = np.random.default_rng(0)  # folded everywhere: wrong as a whole
     wrong = VertexMap.between(source, target, rng.integers(0, target.V, source.V))
-    assert unfolded(wrong, source, target) is wrong
+    assert unfold(wrong, source, target) is wrong
 
 
 def test_large_meshes_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = ball(3), ball(3, 0.0)
     found = folded(source, target)
     monkeypatch.setattr("meshmatch.maps.unfold._MAX_VERTICES", 500)
-    assert unfolded(found, source, target) is found
+    assert unfold(found, source, target) is found
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -211,7 +211,7 @@ def test_nothing_becomes_worse(seed: int) -> None:
     source, target = ball(3), ball(3, 0.0)
     noise = np.random.default_rng(seed).normal(scale=0.05, size=source.verts.shape)
     found = put(source, target, source.verts + noise)
-    before, after = (Folds.of(each, source, target) for each in (found, unfolded(found, source, target)))
+    before, after = (Folds.of(each, source, target) for each in (found, unfold(found, source, target)))
     assert 0.02 < before.flipped + before.crushed < 0.2
     assert after.flipped + after.crushed < before.flipped + before.crushed
 
@@ -220,20 +220,20 @@ def test_what_does_not_become_better_stays(monkeypatch: pytest.MonkeyPatch) -> N
     source, target = ball(3), ball(3, 0.0)
     found = folded(source, target)
     monkeypatch.setattr(_Images, "_solve_poisson", lambda images, rows, laid: np.zeros((len(rows), 3)))
-    smoothed = Folds.of(unfolded(found, source, target), source, target)
+    smoothed = Folds.of(unfold(found, source, target), source, target)
     assert smoothed == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # what cannot be laid out is smoothed
     monkeypatch.setattr("meshmatch.maps.unfold._SMOOTHING_RINGS", ())
-    flat = Folds.of(unfolded(found, source, target), source, target)
+    flat = Folds.of(unfold(found, source, target), source, target)
     assert flat == Folds(0.0, 0.0, pytest.approx(1.0, abs=0.15))  # or laid flat
     monkeypatch.setattr(Disk, "laid_flat", lambda *each: None)
-    np.testing.assert_array_equal(unfolded(found, source, target).points(target), found.points(target))
+    np.testing.assert_array_equal(unfold(found, source, target).points(target), found.points(target))
 
 
 def test_where_the_map_tears_nothing_is_laid_out() -> None:
     source, target = ball(3), ball(3, 0.0)
     places = np.where(source.verts[:, 2:] > 0, -source.verts, source.verts)  # one half goes to the other side
     found = put(source, target, places)
-    points = unfolded(found, source, target).points(target)
+    points = unfold(found, source, target).points(target)
     assert np.linalg.norm(points - found.points(target), axis=1).max() < 0.1
 
 
@@ -271,7 +271,7 @@ def test_triangles_without_height_do_not_keep_folds_shut() -> None:
     pieces = [np.stack(each, 1) for each in ((a, middle, c), (middle, b, c), (a, b, middle))]
     source = Shape(verts, np.concatenate([np.delete(plain.faces, np.s_[::3], axis=0), *pieces]))
     found = folded(source, target)
-    before, after = (Folds.of(each, source, target) for each in (found, unfolded(found, source, target)))
+    before, after = (Folds.of(each, source, target) for each in (found, unfold(found, source, target)))
     assert before.flipped > 0.002
     assert after.flipped < 0.5 * before.flipped
 
@@ -284,12 +284,12 @@ def test_what_would_be_torn_from_its_surroundings_stays(monkeypatch: pytest.Monk
     places = np.where(away < 0.5, [0.5, 0, 0] + (disc.verts - [0.5, 0, 0]) * [1, 1, 0] * inward, disc.verts)
     places[:, 2] = disc.verts[:, 2]
     found = put(disc, disc, places)
-    assert Folds.of(unfolded(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
+    assert Folds.of(unfold(found, disc, disc), disc, disc).crushed < Folds.of(found, disc, disc).crushed
     for name in ("_SMOOTHING_RINGS", "_FLATTENING_RINGS", "_FINAL_RINGS"):
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
     # without a fold, but far away
     monkeypatch.setattr(_Images, "_solve_poisson", lambda *each: solved(*each) - [0.4, 0, 0])
-    np.testing.assert_array_equal(unfolded(found, disc, disc).points(disc), found.points(disc))
+    np.testing.assert_array_equal(unfold(found, disc, disc).points(disc), found.points(disc))
 
 
 def test_faces_that_run_the_other_way_are_no_folds() -> None:
@@ -314,7 +314,7 @@ def test_seams_of_the_target_are_not_in_the_way(monkeypatch: pytest.MonkeyPatch)
     for name in ("_POISSON_RINGS", "_SMOOTHING_RINGS"):
         monkeypatch.setattr(f"meshmatch.maps.unfold.{name}", ())
     assert Folds.of(found, source, cut).flipped > 0.003
-    assert Folds.of(unfolded(found, source, cut), source, cut).flipped == 0
+    assert Folds.of(unfold(found, source, cut), source, cut).flipped == 0
 
 
 def touching(subdivisions: int, turn: float = 0.0) -> tuple[Shape, Ints]:
@@ -335,10 +335,10 @@ def test_no_image_leaves_its_part_where_another_one_touches_it() -> None:
     rest = {"face": foot.face, "barycentric": foot.barycentric, "confidence": np.ones(source.V, np.float32)}
     before = VertexMap.between(source, target, foot.vertex, **rest)
     np.testing.assert_array_equal(theirs[before.index], own)
-    there, back = unfolded_both_ways(before, invert_map(before, source, target), source, target)
+    there, back = unfold_both_ways(before, invert_map(before, source, target), source, target)
     np.testing.assert_array_equal(theirs[there.index], own)
     np.testing.assert_array_equal(own[back.index], theirs)
-    alone = unfolded(before, source, target)
+    alone = unfold(before, source, target)
     assert (alone.points(target) != before.points(target)).any()
     np.testing.assert_array_equal(theirs[alone.index], own)
 
@@ -354,7 +354,7 @@ def test_no_image_leaves_its_layer_while_folds_are_laid_out() -> None:
     foot = MappedMesh.of(target).query(pulled(source, MOVED + V), parts=layer)
     rest = {"face": foot.face, "barycentric": foot.barycentric, "confidence": np.ones(source.V, np.float32)}
     before = VertexMap.between(source, target, foot.vertex, **rest)
-    after = unfolded(before, source, target)
+    after = unfold(before, source, target)
     assert Folds.of(before, source, target).flipped > 0.001
     assert Folds.of(after, source, target).flipped == 0
     np.testing.assert_array_equal(layer[after.index], layer)

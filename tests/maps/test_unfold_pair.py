@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshmatch.maps.unfold_pair import unfolded_pair
+from meshmatch.maps.unfold_pair import unfold_pair
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from tests.maps.solids import grid
@@ -37,10 +37,10 @@ def test_bodies_on_floors_have_the_maps_that_they_have_alone(verdict: str) -> No
     source, target = ball(3), ball(3, 0.0)
     there = replace(folded(source, target), verdict=verdict)
     back = replace(put(target, source, target.verts), verdict=verdict)
-    alone = unfolded_pair(there, lambda: back, source, target, False)
+    alone = unfold_pair(there, lambda: back, source, target, False)
     scenes = on_floor(source, True), on_floor(target, False)
     before = in_scene(there, *scenes), in_scene(back, *scenes[::-1])
-    found = unfolded_pair(before[0], lambda: before[1], *scenes, False)
+    found = unfold_pair(before[0], lambda: before[1], *scenes, False)
     assert (found[1] is None) == (alone[1] is None) == (verdict == "fair")
     for way, (one, other) in enumerate((scenes, scenes[::-1])):
         if found[way] is None:
@@ -54,7 +54,7 @@ def test_bodies_on_floors_have_the_maps_that_they_have_alone(verdict: str) -> No
 def test_a_map_onto_what_was_left_out_stays_as_it_is() -> None:
     source, target = ball(3), on_floor(ball(3), True)
     onto_floor = VertexMap.between(source, target, np.zeros(source.V, int), verdict="good")
-    found, opposite = unfolded_pair(onto_floor, lambda: onto_floor, source, target, False)
+    found, opposite = unfold_pair(onto_floor, lambda: onto_floor, source, target, False)
     assert found is onto_floor and opposite is None
 
 
@@ -71,6 +71,6 @@ def test_vertices_without_a_position_or_a_face_keep_the_images_of_those_that_sta
     rest = {"face": alone.face[rows], "barycentric": alone.barycentric[rows], "verdict": "good"}
     there = VertexMap.between(source, target, alone.index[rows], **rest)
     back = replace(put(target, source, target.verts), verdict="good")
-    found, opposite = unfolded_pair(there, lambda: back, source, target, False)
+    found, opposite = unfold_pair(there, lambda: back, source, target, False)
     assert opposite is not None
     np.testing.assert_allclose(found.points(target)[lost], there.points(target)[lost])

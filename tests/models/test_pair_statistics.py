@@ -10,7 +10,7 @@ from safetensors.numpy import save_file
 from meshmatch.errors import ModelError
 from meshmatch.experiments.makers.pair_statistics import statistics_of
 from meshmatch.fitting.solve.agreement import AgreeConfig, CommonStretch, as_pair, log_stretch
-from meshmatch.geometry.symmetric import entries_of
+from meshmatch.geometry.symmetric import to_entries
 from meshmatch.models import registry
 from meshmatch.models.pair_statistics import PairStatistics, flat, load_pair_statistics, save_pair_statistics, unflat
 from meshmatch.models.registry import add_model, load_model
@@ -36,7 +36,7 @@ def test_a_vector_has_the_length_of_its_matrices() -> None:
     found = symmetric(G)
     assert np.allclose(unflat(flat(found)), found)
     assert np.linalg.norm(flat(found)) == pytest.approx(np.linalg.norm(found))
-    assert flat(found).shape == (entries_of(found).size,)
+    assert flat(found).shape == (to_entries(found).size,)
 
 
 def test_two_individuals_are_told_from_one() -> None:

@@ -11,12 +11,12 @@ from meshmatch.maps.evaluate import X100, Errors
 from meshmatch.render import charts
 from meshmatch.render.charts import (
     Dots,
-    draw_beside,
     draw_curves,
     draw_dots,
     draw_histogram,
     draw_lines,
     draw_losses,
+    draw_panels,
     draw_scree,
 )
 from tests.render.spots import middle, spots
@@ -119,7 +119,7 @@ def test_charts_beside_one_another(tmp_path: Path) -> None:
         "first": ("m", {"a": ((1, 2, 4), (1, 2, 4))}),
         "second": ("s", {"a": ((1, 4), (3, 3)), "b": ((4,), (1.5,))}),
     }
-    draw_beside(charts, tmp_path / "a.png", "modes")
+    draw_panels(charts, tmp_path / "a.png", "modes")
     line = spots(tmp_path / "a.png", 0, right=0.5)
     slope, start = np.polyfit(line[:, 0], line[:, 1], 1)
     assert slope > 0.3

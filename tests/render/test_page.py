@@ -14,10 +14,10 @@ from PIL import Image
 
 from meshmatch.errors import InputError, OptionError, OutputError
 from meshmatch.maps.vertex_map import VertexMap
-from meshmatch.render.facing import facing_alike
+from meshmatch.render.facing import rotation_like
 from meshmatch.render.scales import position_colors
 from meshmatch.render.viewer.assembly import pack, small_integers
-from meshmatch.render.viewer.drawn import draw, relative_size, view_rotations
+from meshmatch.render.viewer.drawn_shapes import draw, relative_size, view_rotations
 from meshmatch.render.viewer.looks import Looks, look_arrays
 from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
@@ -195,7 +195,7 @@ def test_a_vertex_without_a_position_is_not_drawn(tmp_path: Path, cube: Shape) -
 def test_a_large_mesh_is_drawn_coarser_and_says_so(
     tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("meshmatch.render.viewer.page.MOST", 900)
+    monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 900)
     fine = stirred(bump(make_sphere(4)))
     path = tmp_path / "page.html"
     report = write_page(path, fine.source, fine.target, fine.there, fine.back)
@@ -267,7 +267,7 @@ def test_a_fit_that_leans_is_levelled_where_the_shape_stands(make_sphere: Callab
     foot = np.array([-9, -2.2, -9])  # flat below
     tower = Shape(np.maximum(ball.verts * np.array([0.6, 3.0, 0.6]), foot), ball.faces, "tower")
     heading = about(1, 0.6)
-    assert np.allclose(facing_alike(tower, tower.verts, tower.verts @ (about(0, 0.4) @ heading).T), heading)
+    assert np.allclose(rotation_like(tower, tower.verts, tower.verts @ (about(0, 0.4) @ heading).T), heading)
 
 
 def test_given_rotations_are_kept(pair: Pair) -> None:
@@ -392,7 +392,7 @@ def test_a_texture_on_a_coarser_mesh_is_painted(
     tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The image is read at each vertex: its red grows with x."""
-    monkeypatch.setattr("meshmatch.render.viewer.page.MOST", 900)
+    monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 900)
     ball = bump(make_sphere(4))
     low, extent = ball.bounds[0], np.ptp(ball.verts, axis=0)
     uv = ((ball.verts - low) / extent)[:, [0, 2]][ball.faces]

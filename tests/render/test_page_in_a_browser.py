@@ -304,7 +304,7 @@ def test_points_on_either_side(running: Any, pair: Pair, tmp_path: Path) -> None
 def test_a_coarser_mesh_keeps_the_numbers_of_the_file(
     running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("meshmatch.render.viewer.page.MOST", 500)
+    monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 500)
     fine = stirred(bump(make_sphere(4)), "fine.ply")
     write_page(tmp_path / "page.html", fine.source, fine.target, fine.there, fine.back)
     with opened(running, tmp_path / "page.html") as view:

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.shapes.normalise import ALIGNS, align, residual
+from meshmatch.shapes.alignment import ALIGNS, align, alignment_residual
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -61,10 +61,10 @@ def test_the_residual_by_hand() -> None:
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
     a = OrientedPoints(np.array([[0.0, 0, 0], [1, 0, 0]]), up)
     b = OrientedPoints(np.array([[0.0, 0, 0.1], [1, 0, 0.1]]), up)
-    assert residual(a, b) == pytest.approx(0.1)
+    assert alignment_residual(a, b) == pytest.approx(0.1)
     slanted = np.tile([np.sin(np.pi / 3), 0.0, 0.5], (2, 1))  # as far from up as up is long
-    assert residual(a, OrientedPoints(b.points, slanted)) == pytest.approx(np.hypot(0.1, 0.15))
-    assert residual(a, OrientedPoints(b.points + 50, up)) == pytest.approx(0.2)  # capped
+    assert alignment_residual(a, OrientedPoints(b.points, slanted)) == pytest.approx(np.hypot(0.1, 0.15))
+    assert alignment_residual(a, OrientedPoints(b.points + 50, up)) == pytest.approx(0.2)  # capped
 
 
 def test_the_ways_have_names() -> None:

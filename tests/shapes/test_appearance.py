@@ -18,9 +18,9 @@ from PIL import Image
 from meshmatch.errors import InputError
 from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader
-from meshmatch.shapes.colors import LINEAR_OF_BYTE, bytes_of, to_linear, to_srgb
+from meshmatch.shapes.colors import BYTE_TO_LINEAR, linear_to_bytes, to_linear, to_srgb
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.obj_look import second_index
+from meshmatch.shapes.formats.obj_appearance import second_index
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_gltf, write_square_obj
@@ -45,11 +45,11 @@ def test_light_and_color_are_inverses_and_match_the_standard() -> None:
 
 
 def test_the_nearest_byte_is_taken() -> None:
-    assert (bytes_of(LINEAR_OF_BYTE) == np.arange(256)).all()
+    assert (linear_to_bytes(BYTE_TO_LINEAR) == np.arange(256)).all()
     light = np.linspace(0, 1, 100_001).astype(np.float32)
     exact = 255 * to_srgb(light.astype(float))
-    assert np.abs(bytes_of(light) - exact).max() < 0.55
-    assert bytes_of(np.array([-1.0, 7.0], np.float32)).tolist() == [0, 255]
+    assert np.abs(linear_to_bytes(light) - exact).max() < 0.55
+    assert linear_to_bytes(np.array([-1.0, 7.0], np.float32)).tolist() == [0, 255]
 
 
 # glTF

@@ -14,13 +14,13 @@ from meshmatch import blender
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError, OutputError
 from meshmatch.outputs import replace_on_success
 from meshmatch.shapes.appearance import BakedMaterial
-from meshmatch.shapes.dressed_files import Dressed, save_textured, tell_lost
-from meshmatch.shapes.formats import gltf_out
+from meshmatch.shapes.deformed_files import add_appearance, save_moved, warn_about_lost
+from meshmatch.shapes.dressed_files import Dressed, save_textured, warn_about_losses
+from meshmatch.shapes.formats import gltf_write
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.input_files import read_bytes
-from meshmatch.shapes.moved_files import save_moved, tell_left, with_look
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_appearance
 from meshmatch.transfer.weight_files import load_weights
@@ -126,12 +126,12 @@ def test_a_file_is_converted_once_until_it_changes(tmp_path: Path, monkeypatch: 
     log = tmp_path / "log"
     stand_in(tmp_path, monkeypatch, f"open({str(log)!r}, 'a').write('x'); shutil.copyfile(source, output)")
     path = tmp_path / "a.fbx"
-    path.write_bytes(gltf_out.glb_of(tube()))
+    path.write_bytes(gltf_write.glb_of(tube()))
     for _ in range(3):
         meshmatch.load_shape(path)
     assert log.read_text() == "x"
     moved = meshmatch.Shape(tube().verts + 1.0, tube().faces)
-    path.write_bytes(gltf_out.glb_of(moved) + b"    ")
+    path.write_bytes(gltf_write.glb_of(moved) + b"    ")
     assert meshmatch.load_shape(path).verts.max() > tube().verts.max() + 0.5
     assert log.read_text() == "xx"
 
@@ -231,7 +231,7 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path, monkeypatc
 
 def test_what_is_left_out_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(tmp_path, monkeypatch, "print('note: left out skin.png'); shutil.copyfile(source, output)")
-    (tmp_path / "a.fbx").write_bytes(gltf_out.glb_of(tube()))
+    (tmp_path / "a.fbx").write_bytes(gltf_write.glb_of(tube()))
     with pytest.warns(MeshmatchWarning, match=r"a\.fbx: left out skin\.png"):
         meshmatch.load_shape(tmp_path / "a.fbx")
 
@@ -240,16 +240,16 @@ def test_polygons_that_become_triangles_are_told(tmp_path: Path, monkeypatch: py
     """When something is made of the file, not when it is read."""
     stand_in(tmp_path, monkeypatch, "print('with polygons'); shutil.copyfile(source, output)")
     path, out = tmp_path / "a.fbx", tmp_path / "out.fbx"
-    path.write_bytes(gltf_out.glb_of(tube()))
+    path.write_bytes(gltf_write.glb_of(tube()))
     shape = meshmatch.load_shape(path)
     told = r"^out\.fbx does not have the polygons of a\.fbx$"
     with pytest.warns(MeshmatchWarning, match=told):
         save_moved(out, path, shape, np.tile(np.eye(3), (shape.V, 1, 1)))
     with pytest.warns(MeshmatchWarning, match=told):
-        tell_lost(path, out)
-    _, lost = with_look(gltf_out.glb_of(tube()), path, shape)
+        warn_about_losses(path, out)
+    _, lost = add_appearance(gltf_write.glb_of(tube()), path, shape)
     with pytest.warns(MeshmatchWarning, match=told):
-        tell_left(out, path, lost)
+        warn_about_lost(out, path, lost)
 
 
 @needs_blender
@@ -352,10 +352,10 @@ def test_blender_keeps_an_image(suffix: str, tmp_path: Path) -> None:
 
 @needs_blender
 def test_blender_writes_a_textured_mesh_as_fbx(tmp_path: Path) -> None:
-    from meshmatch.shapes.formats import Textured
+    from meshmatch.shapes.formats import TexturedMesh
 
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-    mesh = Textured(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((2, 3, 2)))
+    mesh = TexturedMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((2, 3, 2)))
     save_textured(tmp_path / "a.fbx", mesh, np.full((4, 4, 4), 200, np.uint8))
     assert (tmp_path / "a.fbx").read_bytes().startswith(b"Kaydara FBX Binary")
     assert meshmatch.load_shape(tmp_path / "a.fbx").F == 2

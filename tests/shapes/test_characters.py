@@ -11,12 +11,12 @@ import pytest
 from meshmatch.errors import MeshmatchWarning, OptionError
 from meshmatch.shapes.appearance import BakedMaterial
 from meshmatch.shapes.blend_shapes import BlendShapes
+from meshmatch.shapes.deformed_files import save_moved
 from meshmatch.shapes.dressed_files import Dressed, save_colored
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf_morphs import read_morphs, with_morphs
 from meshmatch.shapes.formats.gltf_vrm import check_character
-from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_coordinates
 from tests.shapes.characters import VERSIONS, image_of, read, said, toon_images, write_character

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.shapes.companions import beside
+from meshmatch.shapes.companions import find_companion
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats.gltf import Document
 from tests.shapes.painted import write_gltf
@@ -25,7 +25,7 @@ def make(folder: Path, *names: str) -> None:
 
 
 def found(folder: Path, name: str, uri: bool) -> str | None:
-    file = beside(folder, name, uri)
+    file = find_companion(folder, name, uri)
     return None if file is None else file.relative_to(folder.resolve()).as_posix()
 
 
@@ -99,7 +99,7 @@ def test_prefers(tmp_path: Path, there: tuple[str, ...], name: str, uri: bool, m
 )
 def test_finds_nothing(tmp_path: Path, name: str, uri: bool) -> None:
     make(tmp_path, "in/skin.png")
-    assert beside(tmp_path, name, uri) is None
+    assert find_companion(tmp_path, name, uri) is None
 
 
 @pytest.mark.parametrize(
@@ -110,8 +110,8 @@ def test_stays_in_the_folder(tmp_path: Path, name: str) -> None:
     make(tmp_path, "inner/a.gltf", "secret.png", "other/secret.png")
     (inner / "link").symlink_to(tmp_path / "other")
     (inner / "link.png").symlink_to(tmp_path / "secret.png")
-    assert beside(inner, name) is beside(inner, name, uri=True) is None
-    assert beside(inner, str(tmp_path / "secret.png")) is None
+    assert find_companion(inner, name) is find_companion(inner, name, uri=True) is None
+    assert find_companion(inner, str(tmp_path / "secret.png")) is None
 
 
 def test_sees_what_changed(tmp_path: Path) -> None:

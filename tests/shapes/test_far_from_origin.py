@@ -14,10 +14,10 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.picture import Look
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape, save_upright
-from meshmatch.shapes.formats import Textured, gltf_out
+from meshmatch.shapes.formats import TexturedMesh, gltf_write
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import Editor
-from meshmatch.shapes.formats.gltf_out import center_of, write_morphs
+from meshmatch.shapes.formats.gltf_write import choose_origin, write_morphs
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.transfer.bake import BakeOptions
@@ -55,7 +55,7 @@ def test_positions_that_were_single_stay_what_they_were(tmp_path: Path, sphere: 
 
 @pytest.mark.parametrize("middle", [(0, 0, 0), (0, 0.9, 0), (3, -2, 1)])
 def test_a_shape_near_the_origin_is_written_as_it_is(sphere: Shape, middle: tuple[float, ...]) -> None:
-    assert not center_of(sphere.verts + middle).any()
+    assert not choose_origin(sphere.verts + middle).any()
 
 
 @pytest.mark.parametrize("stray", [(0, 0, 0), (1e7, 0, 0)])
@@ -79,7 +79,7 @@ def test_textured_and_morphing_files(tmp_path: Path, sphere: Shape) -> None:
     uv = np.zeros((sphere.F, 3, 2))
     image = np.full((2, 2, 4), 255, np.uint8)
     for name in ("a.glb", "a.obj"):
-        save_textured(tmp_path / name, Textured(far.verts, far.faces, uv), image)
+        save_textured(tmp_path / name, TexturedMesh(far.verts, far.faces, uv), image)
         back = load_shape(tmp_path / name).verts[: sphere.V]
         np.testing.assert_allclose(back, far.verts, rtol=0, atol=2e-7 if name == "a.glb" else 0)
     write_morphs(tmp_path / "m.glb", far, {"larger": far.verts + 0.1 * sphere.verts})
@@ -160,7 +160,7 @@ def test_a_glb_that_would_be_larger_than_one_can_be_is_refused(
     held = path.read_bytes()
     assert Editor(Document(path, held)).to_bytes() == held
     path.unlink()
-    monkeypatch.setattr(gltf_out, "_MAX_BYTES", len(held) - 1)
+    monkeypatch.setattr(gltf_write, "_MAX_BYTES", len(held) - 1)
     with pytest.raises(OutputError, match="becomes larger than a glb can be"):
         write_morphs(path, sphere, targets)
     with pytest.raises(OutputError, match=r"sequence\.glb becomes larger than a glb can be"):

@@ -106,7 +106,7 @@ def test_a_compressed_file_is_the_same_shape(tmp_path: Path, make: Any) -> None:
 def test_what_is_written_of_it_needs_no_library(tmp_path: Path, make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     path = make(tmp_path / "a.glb")
     shape = load_shape(path)
-    glb = gltf.understood(path, read_bytes(path), "scene makes", lambda document: Editor(document).to_bytes())
+    glb = gltf.parse_document(path, read_bytes(path), "scene makes", lambda document: Editor(document).to_bytes())
     (tmp_path / "b.glb").write_bytes(glb)
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     plain = load_shape(tmp_path / "b.glb")

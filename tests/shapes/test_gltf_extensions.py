@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
-from meshmatch.shapes.files import load_shape, mesh_list
+from meshmatch.shapes.files import list_meshes, load_shape
 from meshmatch.shapes.formats import gltf
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
 from tests.shapes.painted import write_document
@@ -84,7 +84,7 @@ def test_hidden_meshes_are_left_out_and_said(tmp_path: Path) -> None:
     with pytest.warns(MeshmatchWarning, match="hides 2 of its meshes, which are left out: spare, below"):
         assert load_shape(path).V == 3
     with pytest.warns(MeshmatchWarning):
-        assert mesh_list(path) == [("seen", 3)]
+        assert list_meshes(path) == [("seen", 3)]
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 import meshmatch
 from meshmatch.errors import MeshmatchWarning
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.deformed_files import save_moved
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import INSTANCES, Document
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
-from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from meshmatch.templates.location import bundled_folder

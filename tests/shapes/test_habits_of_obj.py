@@ -8,7 +8,7 @@ import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import load_shape
-from meshmatch.shapes.formats.obj_look import companions
+from meshmatch.shapes.formats.obj_appearance import companions
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_appearance
 from tests.shapes.painted import encoded, write_gltf

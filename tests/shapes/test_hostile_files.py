@@ -13,7 +13,7 @@ import pytest
 from meshmatch.cli import main
 from meshmatch.errors import InputError
 from meshmatch.shapes import formats, input_files
-from meshmatch.shapes.files import load_shape, mesh_list, save_shape
+from meshmatch.shapes.files import list_meshes, load_shape, save_shape
 from meshmatch.shapes.formats import gltf, ply_rows
 from meshmatch.shapes.formats.gltf_attributes import read_skin
 from meshmatch.shapes.input_files import read_npy
@@ -133,7 +133,7 @@ def test_gltf_nodes_that_stand_nowhere(tmp_path: Path, key: str, value: float) -
     path = broken(tmp_path, (("nodes", 0, key), [value] * four), (("nodes", 4, key), [value] * four))
     shape = load_shape(path)
     assert shape.V == 10
-    assert sum(count for _, count in mesh_list(path)) == 10
+    assert sum(count for _, count in list_meshes(path)) == 10
     find_appearance(path, shape)
     read_skin(path, path.read_bytes())
 
@@ -220,7 +220,7 @@ def test_more_than_the_bytes_of_a_file_can_mean(tmp_path: Path, monkeypatch: pyt
 
 
 def test_text_of_more_lines_than_it_may_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(input_files, "ROOM", 10_000)
+    monkeypatch.setattr(input_files, "MEMORY_ALLOWANCE", 10_000)
     for name, content in (("a.obj", b"v 0 0 0\n"), ("a.xyz", b"0 0 0\n"), ("a.off", b"OFF 1 0 0\n0 0 0\n")):
         refused(tmp_path / name, content + b"\n" * 1000, "promises too much")
     monkeypatch.setattr(input_files, "LARGEST_TEXT", 900)

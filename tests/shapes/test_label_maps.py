@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.errors import InputError, MeshmatchWarning
-from meshmatch.shapes.files import load_shape, mesh_list
+from meshmatch.shapes.files import list_meshes, load_shape
 from meshmatch.shapes.landmark_files import mesh_space
 from meshmatch.shapes.shape import Shape
 
@@ -115,7 +115,7 @@ def test_labels_lie_where_the_file_has_them(tmp_path: Path, case: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.warns(MeshmatchWarning, match="holds 2 labels, and all are read: 3, 7; choose with --only"):
         both = load_shape(tmp_path / name)
-    (first, count), second = mesh_list(tmp_path / name)
+    (first, count), second = list_meshes(tmp_path / name)
     assert (first, second[0], count + second[1]) == ("3", "7", both.V)
     is_the_ball(Shape(both.verts[:count], both.faces[(both.faces < count).all(axis=1)]))
     one = load_shape(tmp_path / name, only="3")
@@ -136,7 +136,7 @@ def test_voxels_in_a_file_beside_it(tmp_path: Path, name: str, header: Callable[
     with pytest.raises(InputError, match=r"there is no file \.\./a\.raw in its folder"):
         load_shape(tmp_path / "in" / name)
     (tmp_path / name).write_bytes(header(where="a.raw"))
-    assert [label for label, _ in mesh_list(tmp_path / name)] == ["3", "7"]
+    assert [label for label, _ in list_meshes(tmp_path / name)] == ["3", "7"]
 
 
 def test_segments_of_slicer_have_names(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_segments_of_slicer_have_names(tmp_path: Path) -> None:
     text = text.replace("directions: ", "directions: none ")
     layers = np.stack([LABELS == 7, LABELS == 3])
     (tmp_path / "a.seg.nrrd").write_bytes(text.encode() + voxels(labels=layers))
-    assert [label for label, _ in mesh_list(tmp_path / "a.seg.nrrd")] == ["1", "Left femur"]
+    assert [label for label, _ in list_meshes(tmp_path / "a.seg.nrrd")] == ["1", "Left femur"]
     shape = load_shape(tmp_path / "a.seg.nrrd", only="left*")
     assert shape.weights is not None
     chosen = shape.weights[shape.faces].all(axis=1)

@@ -14,7 +14,7 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.landmark_files import mesh_space, read_landmark_file
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.prepared_folder import KnownPoints, in_one_order, read_known_points, read_landmarks
+from meshmatch.templates.prepared_folder import KnownPoints, read_known_points, read_landmarks, sort_by_name
 from meshmatch.transfer.landmarks import at_vertices, load_landmarks, push_landmarks, save_landmarks
 from tests.conftest import icosphere
 
@@ -227,12 +227,12 @@ def test_points_of_a_folder_are_ordered_by_their_names() -> None:
     first = KnownPoints(POINTS, ("a", "b", "c"))
     second = KnownPoints(POINTS[::-1], ("c", "b", "a"))
     fewer = KnownPoints(POINTS[1:], ("b", "c"))
-    found = in_one_order([first, None, second, fewer])
+    found = sort_by_name([first, None, second, fewer])
     assert found[1] is None
     assert all(each is not None and np.array_equal(each[1:], POINTS[1:]) for each in (found[0], found[2], found[3]))
     assert found[3] is not None and np.isnan(found[3][0]).all()
     bare = KnownPoints(POINTS[::-1], ())
     for others in ([first, bare], [first, KnownPoints(POINTS, ("x", "y", "z"))]):
-        assert [np.array_equal(each, one.points) for each, one in zip(in_one_order(others), others, strict=True)] == [
+        assert [np.array_equal(each, one.points) for each, one in zip(sort_by_name(others), others, strict=True)] == [
             True
         ] * 2

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from meshmatch.outputs import numbered_apart
+from meshmatch.outputs import make_unique
 from meshmatch.shapes.appearance import BakedMaterial
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats.gltf import Document
-from meshmatch.shapes.formats.gltf_dressed import dressed
+from meshmatch.shapes.formats.gltf_attachments import reattach_children
 from meshmatch.shapes.formats.gltf_edit import Editor
-from meshmatch.shapes.formats.gltf_former import reattach_children
-from meshmatch.shapes.formats.gltf_humanoid import person_of
+from meshmatch.shapes.formats.gltf_humanoid import find_humanoid_bones
+from meshmatch.shapes.formats.gltf_materials import with_material
 from meshmatch.shapes.formats.gltf_morphs import read_morphs, with_morphs
 from meshmatch.shapes.formats.gltf_prune import drop_nodes
 from meshmatch.shapes.formats.gltf_rig import Binding, Rig, nodes_of_skeleton
@@ -81,7 +81,7 @@ def test_a_person_of_very_many_bones(tmp_path: Path) -> None:
         one = write(tmp_path / "b.gltf", nodes=nodes, skins=skins, meshes=[], **character)
 
         def work() -> bool:
-            found = person_of(one if named else other, one)
+            found = find_humanoid_bones(one if named else other, one)
             return found is not None and found.bones == {bone: each["node"] for bone, each in bones.items()}
 
         return work
@@ -197,7 +197,7 @@ def test_materials(tmp_path: Path) -> None:
         meshes = [{"primitives": [part]}]
         document = write(tmp_path / "a.gltf", nodes=[{"mesh": 0}], meshes=meshes, materials=materials, **variants)
         baked = BakedMaterial(np.full((4, 4, 4), 255, np.uint8))
-        return lambda: dressed(document, np.zeros((2, 3, 2)), True, baked, np.eye(3))
+        return lambda: with_material(document, np.zeros((2, 3, 2)), True, baked, np.eye(3))
 
     made = Document(tmp_path / "b.glb", grows_with_size(prepared, 20_000)).json["materials"]
     assert [each["name"] for each in made] == [f"{k}" for k in range(20_000)]
@@ -205,6 +205,6 @@ def test_materials(tmp_path: Path) -> None:
 
 def test_names_that_are_alike() -> None:
     words = ["Smile", "smile", "smile-2", "smile", "open", "smile"]
-    assert numbered_apart(words, "-", str.lower) == ["Smile", "smile-2", "smile-2-2", "smile-3", "open", "smile-4"]
-    assert numbered_apart(words, " ") == ["Smile", "smile", "smile-2", "smile 2", "open", "smile 3"]
-    assert grows_with_size(lambda count: lambda: numbered_apart(["_"] * count, "-"), 20_000)[-1] == "_-20000"
+    assert make_unique(words, "-", str.lower) == ["Smile", "smile-2", "smile-2-2", "smile-3", "open", "smile-4"]
+    assert make_unique(words, " ") == ["Smile", "smile", "smile-2", "smile 2", "open", "smile 3"]
+    assert grows_with_size(lambda count: lambda: make_unique(["_"] * count, "-"), 20_000)[-1] == "_-20000"

@@ -10,7 +10,7 @@ import trimesh
 
 from meshmatch.cli import main
 from meshmatch.errors import InputError
-from meshmatch.shapes.files import load_shape, load_shapes, mesh_list, save_shape
+from meshmatch.shapes.files import list_meshes, load_shape, load_shapes, save_shape
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 
@@ -31,11 +31,11 @@ def knight(tmp_path: Path) -> Path:
 
 
 def test_names_are_told(knight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert mesh_list(knight) == [("body_node", 642), ("sword_l_node", 8), ("shield_node", 42)]
+    assert list_meshes(knight) == [("body_node", 642), ("sword_l_node", 8), ("shield_node", 42)]
     assert main(["info", str(knight), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["meshes"][1] == "sword_l_node (8 vertices)"
     save_shape(tmp_path / "plain.ply", load_shape(knight))
-    assert mesh_list(tmp_path / "plain.ply") == []
+    assert list_meshes(tmp_path / "plain.ply") == []
 
 
 @pytest.mark.parametrize(

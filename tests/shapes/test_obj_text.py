@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError
+from meshmatch.shapes.deformed_files import save_moved
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.obj_text import with_positions
-from meshmatch.shapes.moved_files import save_moved
 from meshmatch.shapes.shape import Shape
 
 TEXT = b"""# a leaf; v 1 2 3 is no vertex here

@@ -9,7 +9,7 @@ import trimesh
 
 from meshmatch.errors import InputError
 from meshmatch.shapes.files import load_shape, load_shapes, save_shape
-from meshmatch.shapes.parts import Parts, apart, leave_out, tries
+from meshmatch.shapes.parts import Parts, are_separate, candidate_sets, leave_out
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -86,7 +86,7 @@ def test_a_body_is_found_beside_other_things() -> None:
         "room": [floor(body, 4.0), chair(beside(body)), chair(beside(body, -1.5)), pack(body)],
     }.items():
         parts = Parts.of(together(name, body, *others))
-        assert tries(parts)[0] == {parts.number[0]}, name
+        assert candidate_sets(parts)[0] == {parts.number[0]}, name
 
 
 def test_what_belongs_to_a_body_stays_with_it() -> None:
@@ -94,7 +94,7 @@ def test_what_belongs_to_a_body_stays_with_it() -> None:
     dressed = together("dressed", body, coat(body), eyes(body))
     for others in ([floor(body)], [pedestal(body)], [chair(beside(body, 0.5))]):
         parts = Parts.of(together("scene", dressed, *others))
-        first = tries(parts)[0]
+        first = candidate_sets(parts)[0]
         assert first == set(parts.number[: dressed.V].tolist())
         assert len(first) == 4
 
@@ -103,12 +103,12 @@ def test_two_bodies_are_two_tries() -> None:
     one = sample(BODY)
     parts = Parts.of(together("two", one, second(one), floor(one, 4.0)))
     numbers = {frozenset([int(parts.number[0])]), frozenset([int(parts.number[one.V])])}
-    found = set(tries(parts))
+    found = set(candidate_sets(parts))
     assert numbers <= found
     a, b = numbers
-    assert apart(parts, a, b) and not apart(parts, a, a | b)
+    assert are_separate(parts, a, b) and not are_separate(parts, a, a | b)
     dressed = Parts.of(together("dressed", one, coat(one)))
-    assert not apart(dressed, frozenset([1]), frozenset([2]))  # a coat is around its body
+    assert not are_separate(dressed, frozenset([1]), frozenset([2]))  # a coat is around its body
 
 
 def test_thousands_of_parts_make_few_tries_at_once() -> None:
@@ -123,7 +123,7 @@ def test_thousands_of_parts_make_few_tries_at_once() -> None:
 
         def work() -> tuple[Parts, list[frozenset[int]]]:
             parts = Parts.of(together("loose", body, loose))
-            found = list(tries(parts))
+            found = list(candidate_sets(parts))
             assert len(parts) == count + 1 and 1 <= len(found) <= 6
             assert any(1 in each and len(each) < 0.2 * count for each in found)
             return parts, found
@@ -134,7 +134,7 @@ def test_thousands_of_parts_make_few_tries_at_once() -> None:
 
 
 def test_one_part_leaves_nothing_to_try(sphere: Shape) -> None:
-    assert tries(Parts.of(sphere)) == []
+    assert candidate_sets(Parts.of(sphere)) == []
 
 
 def test_parts_are_left_out_and_keep_their_places(three: Shape) -> None:

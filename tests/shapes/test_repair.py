@@ -10,9 +10,9 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import edges_of, is_watertight, same_rows, unit
+from meshmatch.geometry.triangles import edges_of, is_watertight, normalized, same_rows
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.repair import Repaired, repair, turned_outwards
+from meshmatch.shapes.repair import Repaired, oriented_outwards, repair
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 from tests.transfer.rigs import write_tube
@@ -173,7 +173,7 @@ def test_faces_end_as_they_should_be(case: str) -> None:
     given = Shape(right.verts, faces)
     done = repair(given)
     np.testing.assert_allclose(
-        unit(done.shape.face_vectors), unit(Shape(right.verts, right.faces).face_vectors), atol=1e-9
+        normalized(done.shape.face_vectors), normalized(Shape(right.verts, right.faces).face_vectors), atol=1e-9
     )
     turned = int((faces != right.faces).any(axis=1).sum())
     told = [note for note in done.notes if "turned" in note]
@@ -230,7 +230,7 @@ def with_a_cone(shape: Shape, length: float, wide: float) -> Shape:
     tip = int(shape.verts[:, 2].argmax())
     around = np.setdiff1d(shape.faces[(shape.faces == tip).any(axis=1)], tip)
     verts = shape.verts.copy()
-    verts[around, :2] = wide * unit(verts[around, :2])
+    verts[around, :2] = wide * normalized(verts[around, :2])
     verts[tip] = [0, 0, 1 + length]
     return Shape(verts, shape.faces, "cone")
 
@@ -523,7 +523,7 @@ def test_a_scene_names_its_meshes(tmp_path: Path) -> None:
 
 def test_faces_turned_outwards_and_nothing_else() -> None:
     ball = icosphere(2)
-    assert turned_outwards(ball) is ball
+    assert oriented_outwards(ball) is ball
     apart = Shape(
         ball.verts[ball.faces.ravel()], np.arange(3 * ball.F).reshape(-1, 3)
     )  # open everywhere but for its place
@@ -531,11 +531,11 @@ def test_faces_turned_outwards_and_nothing_else() -> None:
         for wrong in (np.arange(shape.F), np.arange(0, shape.F, 3)):
             faces = shape.faces.copy()
             faces[wrong] = faces[wrong][:, ::-1]
-            found = turned_outwards(Shape(shape.verts, faces))
+            found = oriented_outwards(Shape(shape.verts, faces))
             assert np.array_equal(np.sort(found.faces, axis=1), np.sort(faces, axis=1))
             assert np.allclose(found.face_vectors, shape.face_vectors)
     cloud = Shape(ball.verts, np.empty((0, 3), np.int64))
-    assert turned_outwards(cloud) is cloud
+    assert oriented_outwards(cloud) is cloud
 
 
 def test_what_hangs_from_a_character_is_named() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.shapes.sampling import farthest_points, sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -15,7 +15,7 @@ def test_samples_lie_where_they_say(torus: Shape) -> None:
     np.testing.assert_allclose(np.einsum("pk,pki->pi", samples.barycentric, corners), samples.points)
     np.testing.assert_allclose(samples.barycentric.sum(axis=1), 1.0)
     assert samples.barycentric.min() >= 0
-    np.testing.assert_array_equal(samples.normals, unit(torus.face_vectors)[samples.face])
+    np.testing.assert_array_equal(samples.normals, normalized(torus.face_vectors)[samples.face])
     nearest = torus.faces[samples.face, samples.barycentric.argmax(axis=1)]
     np.testing.assert_array_equal(samples.vertex, nearest)
 

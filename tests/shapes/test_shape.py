@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.shapes.shape import Shape
 
 
@@ -15,8 +15,8 @@ def test_cube_by_hand(cube: Shape) -> None:
     np.testing.assert_allclose(cube.bounds, [[0, 0, 0], [1, 1, 1]])
     assert cube.diagonal == pytest.approx(3**0.5)
     centers = cube.verts[cube.faces].mean(axis=1)
-    np.testing.assert_allclose(np.abs(unit(cube.face_vectors)).max(axis=1), 1.0)
-    assert (np.einsum("fi,fi->f", unit(cube.face_vectors), centers - 0.5) > 0.4).all()  # outward
+    np.testing.assert_allclose(np.abs(normalized(cube.face_vectors)).max(axis=1), 1.0)
+    assert (np.einsum("fi,fi->f", normalized(cube.face_vectors), centers - 0.5) > 0.4).all()  # outward
 
 
 def test_the_box_is_around_the_surface(cube: Shape) -> None:
@@ -49,7 +49,7 @@ def test_vertex_normals_are_weighted_by_area() -> None:
 def test_flat_face_has_a_zero_normal_and_no_nan() -> None:
     shape = Shape([[0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 5, 5]], [[0, 1, 2]])
     assert shape.area == 0
-    assert (unit(shape.face_vectors) == 0).all()
+    assert (normalized(shape.face_vectors) == 0).all()
     assert (shape.vertex_normals == 0).all()
 
 

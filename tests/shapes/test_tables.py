@@ -9,7 +9,7 @@ import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.maps.files import load_map
-from meshmatch.shapes.tables import is_missing, number, read_table, whole
+from meshmatch.shapes.tables import as_whole_numbers, is_missing, parse_number, read_table
 from meshmatch.shapes.vertex_lists import load_pairs, load_points
 from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
@@ -186,11 +186,11 @@ def test_labels_that_are_missing_among_numbers(tmp_path: Path) -> None:
 
 
 def test_numbers_and_whole_numbers() -> None:
-    assert [number(cell) for cell in ("1e3", " -0,5 ", ".5", "inf", "+2.")] == [1000, -0.5, 0.5, np.inf, 2]
-    assert whole(np.array([1.0, 2e3])).tolist() == [1, 2000]
+    assert [parse_number(cell) for cell in ("1e3", " -0,5 ", ".5", "inf", "+2.")] == [1000, -0.5, 0.5, np.inf, 2]
+    assert as_whole_numbers(np.array([1.0, 2e3])).tolist() == [1, 2000]
     for bad in ([1.5], [np.nan], [1e17], [np.inf]):
         with pytest.raises(ValueError, match=r"whole|large"):
-            whole(np.array(bad))
+            as_whole_numbers(np.array(bad))
 
 
 def test_rows_that_differ_are_told_by_their_line(tmp_path: Path) -> None:

@@ -8,28 +8,28 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from meshmatch.errors import OptionError, OutputError
-from meshmatch.geometry.triangles import closest_on_triangles, same_rows, unit
+from meshmatch.geometry.triangles import closest_on_triangles, normalized, same_rows
 from meshmatch.shapes import dressed_files
 from meshmatch.shapes.appearance import png_bytes
-from meshmatch.shapes.colors import LINEAR_OF_BYTE
+from meshmatch.shapes.colors import BYTE_TO_LINEAR
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.formats.seams import split_at_seams
 from meshmatch.shapes.shape import Shape
-from meshmatch.shapes.textured_files import files_of, load_appearance, load_coordinates
+from meshmatch.shapes.textured_files import load_appearance, load_coordinates, output_files
 from meshmatch.transfer.texels import Pyramid
 from tests.shapes.painted import CORNERS, FACES, UV, quarters
 
 
 @pytest.fixture
-def ball(sphere: Shape) -> tuple[Textured, np.ndarray]:
+def ball(sphere: Shape) -> tuple[TexturedMesh, np.ndarray]:
     """A sphere with coordinates of its own for every triangle, and a picture of noise."""
     rng = np.random.default_rng(0)
     uv = rng.random((sphere.F, 3, 2)).astype(np.float32).astype(float)
     uv[:200] = sphere.verts[sphere.faces[:200]][:, :, :2] / 2 + 0.5  # and some without seams
     image = rng.integers(0, 256, (16, 16, 4), dtype=np.uint8)
-    return Textured(sphere.verts, sphere.faces, uv, "blend"), image
+    return TexturedMesh(sphere.verts, sphere.faces, uv, "blend"), image
 
 
 def test_vertices_are_split_at_seams_alone() -> None:
@@ -45,7 +45,7 @@ def test_vertices_are_split_at_seams_alone() -> None:
     np.testing.assert_array_equal(places[faces], uv)
 
 
-def test_split_vertices_keep_their_order_and_their_places(ball: tuple[Textured, np.ndarray]) -> None:
+def test_split_vertices_keep_their_order_and_their_places(ball: tuple[TexturedMesh, np.ndarray]) -> None:
     mesh, _ = ball
     vertex, uv, faces = split_at_seams(len(mesh.verts), mesh.faces, mesh.uv)
     V = len(mesh.verts)
@@ -62,7 +62,7 @@ def test_vertices_without_a_face_stay() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_written_and_read_again(tmp_path: Path, ball: tuple[Textured, np.ndarray], suffix: str) -> None:
+def test_written_and_read_again(tmp_path: Path, ball: tuple[TexturedMesh, np.ndarray], suffix: str) -> None:
     mesh, image = ball
     path = tmp_path / f"my ball{suffix}"
     save_textured(path, mesh, image)
@@ -79,12 +79,12 @@ def test_written_and_read_again(tmp_path: Path, ball: tuple[Textured, np.ndarray
     np.testing.assert_array_equal(own, look.uv)
     np.testing.assert_array_equal(look.materials[0].image, image)
     assert look.materials[0].alpha == "blend"
-    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in files_of(path))
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in output_files(path))
 
 
 @pytest.mark.parametrize("alpha", ["opaque", "mask", "blend"])
 def test_the_meaning_of_alpha_is_written(tmp_path: Path, alpha: str) -> None:
-    mesh = Textured(CORNERS, FACES, UV[FACES] + 3.0, alpha, 0.25)  # type: ignore[arg-type]
+    mesh = TexturedMesh(CORNERS, FACES, UV[FACES] + 3.0, alpha, 0.25)  # type: ignore[arg-type]
     save_textured(tmp_path / "a.glb", mesh, quarters())
     found = load_appearance(tmp_path / "a.glb", load_shape(tmp_path / "a.glb")).materials[0]
     assert found.alpha == alpha and found.wrap == ("repeat", "repeat")
@@ -95,12 +95,12 @@ def test_the_meaning_of_alpha_is_written(tmp_path: Path, alpha: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_trimesh_sees_the_same_colors(tmp_path: Path, ball: tuple[Textured, np.ndarray], suffix: str) -> None:
+def test_trimesh_sees_the_same_colors(tmp_path: Path, ball: tuple[TexturedMesh, np.ndarray], suffix: str) -> None:
     """The second implementation: its own reader, its own weights, its own look-up of the picture."""
     mesh, image = ball
     image[..., 3] = 255
     path = tmp_path / f"ball{suffix}"
-    save_textured(path, Textured(mesh.verts, mesh.faces, mesh.uv), image)
+    save_textured(path, TexturedMesh(mesh.verts, mesh.faces, mesh.uv), image)
     (other,) = trimesh.load_scene(path, process=False).geometry.values()
     material = other.visual.material
     picture = material.baseColorTexture if suffix == ".glb" else material.image
@@ -125,7 +125,7 @@ def test_trimesh_sees_the_same_colors(tmp_path: Path, ball: tuple[Textured, np.n
     middle = (np.floor(ours * 16) + 0.5) / 16
     light = pyramid.sample(*middle.T.astype(np.float32), np.zeros(500, np.float32))
     column, row = np.floor(ours * 16).astype(int).clip(0, 15).T
-    np.testing.assert_allclose(light[:3].T, LINEAR_OF_BYTE[image[row, column, :3]], atol=1e-4)
+    np.testing.assert_allclose(light[:3].T, BYTE_TO_LINEAR[image[row, column, :3]], atol=1e-4)
     # its texels lie at whole multiples of 1 / 15, so ours are asked there
     nearest = np.round(np.stack([uv[:, 0] * 15, 15 - uv[:, 1] * 15], 1)).astype(int)
     at = np.stack([nearest[:, 0] / 15, 1 - nearest[:, 1] / 15], 1)
@@ -143,7 +143,7 @@ def test_a_picture_without_holes_has_no_alpha_channel() -> None:
 
 def test_all_files_appear_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.mtl").write_text("mine")
-    mesh = Textured(CORNERS, FACES, UV[FACES])
+    mesh = TexturedMesh(CORNERS, FACES, UV[FACES])
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -160,7 +160,7 @@ def test_all_files_appear_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_places_that_cannot_be_claimed(tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
-    mesh = Textured(CORNERS, FACES, UV[FACES])
+    mesh = TexturedMesh(CORNERS, FACES, UV[FACES])
     with pytest.raises(OutputError, match=r"a\.png"):
         save_textured(tmp_path / "a.obj", mesh, quarters())
     with pytest.raises(OptionError, match="cannot write a texture"):
@@ -190,7 +190,7 @@ def stored_normals(path: Path) -> np.ndarray:
     return np.asarray(mesh.vertex_normals)
 
 
-def test_a_glb_has_unit_normals_that_seams_share(tmp_path: Path, ball: tuple[Textured, np.ndarray]) -> None:
+def test_a_glb_has_unit_normals_that_seams_share(tmp_path: Path, ball: tuple[TexturedMesh, np.ndarray]) -> None:
     mesh, image = ball
     save_textured(tmp_path / "a.glb", mesh, image)
     shape = load_shape(tmp_path / "a.glb")
@@ -208,5 +208,5 @@ def test_normals_of_a_plain_glb_keep_sharp_edges(tmp_path: Path, cube: Shape) ->
     shape = Shape(np.concatenate([corners, [[9, 9, 9]]]), np.arange(len(corners)).reshape(-1, 3))
     save_shape(tmp_path / "a.glb", shape)
     normals = stored_normals(tmp_path / "a.glb")
-    np.testing.assert_allclose(normals[:-1], np.repeat(unit(shape.face_vectors), 3, axis=0), atol=1e-6)
+    np.testing.assert_allclose(normals[:-1], np.repeat(normalized(shape.face_vectors), 3, axis=0), atol=1e-6)
     assert normals[-1].tolist() == [0, 0, 1]

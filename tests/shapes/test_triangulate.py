@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.shapes.sampling import sample_surface, triangulate_cloud
 from meshmatch.shapes.shape import Shape
 
@@ -17,7 +17,7 @@ def test_a_ball_of_points_becomes_a_ball(sphere: Shape) -> None:
     mesh = Shape(cloud.verts[kept], faces)
     assert mesh.area == pytest.approx(sphere.area, rel=0.02)
     centers = mesh.verts[mesh.faces].mean(1)
-    assert ((unit(mesh.face_vectors) * centers).sum(1) > 0.9).all()  # outwards, all of them
+    assert ((normalized(mesh.face_vectors) * centers).sum(1) > 0.9).all()  # outwards, all of them
 
 
 def test_many_points_are_thinned_and_noise_leaves_a_surface(sphere: Shape) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.fields.shape_functions import build_field
 from meshmatch.geometry.kernels import poorly_supported, support_pairs
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import make
@@ -22,7 +22,7 @@ from meshmatch.templates.make import (
     choose_nodes,
     edge_graph,
     grow_radii,
-    lay_nodes,
+    place_nodes,
     spectral_clusters,
 )
 from meshmatch.templates.template import Template, load_template
@@ -163,7 +163,7 @@ def test_what_rules_reject(ring: Shape) -> None:
 
 def test_a_rejection_that_leaves_nothing_becomes_milder_or_names_the_vertices(monkeypatch: pytest.MonkeyPatch) -> None:
     fold, config = two_plates(0.1), NodeConfig(strategy="geodesic", K=60, radius=0.2, depth=0.0)
-    laid = lay_nodes(fold, config)
+    laid = place_nodes(fold, config)
     assert badly_held(fold.verts, laid.nodes, 0.2) == [] and laid.taken < laid.refused
     monkeypatch.setattr("meshmatch.templates.make._GEODESIC_SHARES", (0.2,))
     with pytest.raises(TemplateError, match="vertices"):
@@ -248,7 +248,7 @@ def test_missing_vertices_are_completed(ring: Shape) -> None:
 def test_radii_grow_where_vertices_lack_nodes(ring: Shape) -> None:
     """Nodes stay as they are; no vertex is left, and the nodes that had no need to grow have not."""
     config = NodeConfig(strategy="uniform", K=40, radius=0.19, grow=True)
-    laid = lay_nodes(ring, config)
+    laid = place_nodes(ring, config)
     assert len(laid.nodes) == 40
     assert isinstance(laid.radius, np.ndarray)
     assert laid.radius.min() == 0.19 and 0.19 < laid.radius.max() < 0.3
@@ -258,7 +258,7 @@ def test_radii_grow_where_vertices_lack_nodes(ring: Shape) -> None:
     # a field of the first radii is refused, and one step less of growth is too little somewhere
     smaller = np.maximum(0.19, laid.radius / 1.05)
     assert len(poorly_supported(ring.verts, laid.nodes, smaller))
-    enough = lay_nodes(ring, replace(config, K=200, radius=0.3))
+    enough = place_nodes(ring, replace(config, K=200, radius=0.3))
     assert enough.radius == 0.3
     assert np.array_equal(enough.nodes, choose_nodes(ring, replace(config, K=200, radius=0.3, grow=False)))
 
@@ -268,7 +268,7 @@ def test_radii_grow_under_the_strategy_itself() -> None:
     fold, config = two_plates(0.2), NodeConfig(strategy="geodesic", K=60, radius=0.18, depth=0.08)
     samples, candidates = make._candidates(fold, config, noisy=False)
     allowed = next(make._allowed(fold, config, candidates, None, samples))
-    laid = lay_nodes(fold, replace(config, grow=True))
+    laid = place_nodes(fold, replace(config, grow=True))
     assert cKDTree(candidates[allowed]).query(laid.nodes)[0].max() == 0
     assert laid.refused == pytest.approx(1 - allowed.mean())
     assert 0.5 < laid.refused < 0.9 and laid.taken == laid.refused

@@ -13,7 +13,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates import prepared_folder
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepared_folder import frame_of, read_registered, read_samples
+from meshmatch.templates.prepared_folder import card_frame, read_registered, read_samples
 from meshmatch.templates.template import load_template
 
 FEW = NodeConfig(strategy="uniform", K=60, radius=0.3)
@@ -234,12 +234,12 @@ def test_correspondence_says_whether_registered_shapes_stand_alike(
     save_shape(folder / "egg3.obj", Shape(egg(sphere, 2) @ quarter.T, sphere.faces))
     made = prepared(folder, tmp_path / "turned", FEW)
     assert (len(made.shapes), made.align) == (4, "rigid")
-    assert frame_of(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
+    assert card_frame(tmp_path / "turned") == {"orientation": "rigid", "scale": "area"}
     assert prepared(folder, tmp_path / "given", FEW, align="none").align == "none"
-    assert frame_of(tmp_path / "nowhere") is None
+    assert card_frame(tmp_path / "nowhere") is None
     monkeypatch.setattr(prepared_folder, "SMALL_DATA", 4)
     assert prepared(folder, tmp_path / "many", FEW).align == "none"
-    assert frame_of(tmp_path / "many") is None
+    assert card_frame(tmp_path / "many") is None
 
 
 def test_registered_shapes_are_learned_at_equal_areas_alone(folder: Path, tmp_path: Path) -> None:
@@ -248,4 +248,4 @@ def test_registered_shapes_are_learned_at_equal_areas_alone(folder: Path, tmp_pa
         read_registered(tmp_path / "out", made.template)
     assert "--unsupervised" in caught.value.hint
     assert read_samples(tmp_path / "out", made.template).scale == "sphere"
-    assert frame_of(tmp_path / "out") is None
+    assert card_frame(tmp_path / "out") is None

@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from meshmatch.errors import TemplateError
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, low_mesh, make_template
 from meshmatch.templates.template import Template, load_template, read_template, save_template
@@ -67,7 +67,7 @@ def test_low_mesh_keeps_a_subset_of_the_vertices(sphere: Shape) -> None:
     assert ((a != b) & (b != c) & (c != a)).all()
     small = Shape(sphere.verts[keep], faces)
     assert small.area == pytest.approx(4 * np.pi, rel=0.05)  # still the sphere
-    assert (np.einsum("fi,fi->f", unit(small.face_vectors), small.verts[faces].mean(1)) > 0.9).mean() > 0.98
+    assert (np.einsum("fi,fi->f", normalized(small.face_vectors), small.verts[faces].mean(1)) > 0.9).mean() > 0.98
     same, all_faces = low_mesh(sphere, 5000)
     assert np.array_equal(same, np.arange(sphere.V))
     assert np.array_equal(all_faces, sphere.faces)

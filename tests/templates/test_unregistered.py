@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from meshmatch.api import prepare as preparing
 from meshmatch.api.prepare import PrepareConfig, Prepared, prepare
 from meshmatch.errors import InputError, OptionError
-from meshmatch.fitting.without_model import Standing
+from meshmatch.fitting.without_model import RigidAlignment
 from meshmatch.geometry.frames import Frame
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.repair import repair
@@ -127,7 +127,7 @@ def test_of_shapes_that_stand_alike_the_template_is_the_mean(five: Path, tmp_pat
 
 
 def test_a_named_template_stays(five: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preparing, "standing", lambda *_: Standing(Frame.identity(), 0.1, True))
+    monkeypatch.setattr(preparing, "align_by_fits", lambda *_: RigidAlignment(Frame.identity(), 0.1, True))
     made = prepared(five, tmp_path / "out", landmarks=".tips.npy", template="pear4")
     assert made.template.source == "pear4.ply of five"
     as_it_is = prepared(five, tmp_path / "out", landmarks=".tips.npy", template="pear4", align="none")

@@ -14,8 +14,8 @@ from meshmatch.models.registry import load_model
 from meshmatch.progress import Progress
 from meshmatch.training import aligner as stage
 from meshmatch.training.aligner import Aligned, train_aligner
-from meshmatch.training.alone import ALIGNER
 from meshmatch.training.datasets import BatchDataset
+from meshmatch.training.folder_lock import ALIGNER
 from meshmatch.training.loop import TrainConfig
 from meshmatch.training.recipes import Recipe
 from meshmatch.training.train import CardFacts, build_dataset, build_deformer, train_model

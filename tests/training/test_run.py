@@ -38,7 +38,7 @@ from meshmatch.training.load_data import known_template
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
 from meshmatch.training.losses import CorrespondenceLoss
 from meshmatch.training.recipe_files import read_recipe
-from meshmatch.training.recipes import Recipe, default, going_on, paper, people, recipe_for
+from meshmatch.training.recipes import Recipe, default, fine_tuning, paper, people, recipe_for
 from meshmatch.training.records import curves
 from meshmatch.training.scans import ScanConfig
 from meshmatch.training.train import CardFacts, train, train_model
@@ -452,7 +452,7 @@ def test_a_model_goes_on_with_shapes_that_it_has_fitted(prepared: Path, tmp_path
     for wrong in (verts[:, 1:], verts[0], np.where(verts > 0, np.nan, verts)):
         with pytest.raises(InputError, match="shapes of 162 vertices"):
             replace(known, verts=wrong)
-    usual = going_on(start)
+    usual = fine_tuning(start)
     assert (usual.network, usual.kernel, usual.deform) == (SMALL.network, SMALL.kernel, True)
     card = verify_model(
         train(

@@ -6,7 +6,7 @@ from scipy.sparse import csr_array
 
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import joint_table
-from meshmatch.transfer.clean_weights import beyond, clean_weights, rigid
+from meshmatch.transfer.clean_weights import clean_weights, find_uncovered, make_rigid
 from tests.transfer.rigs import AROUND, tube, weights_of
 
 
@@ -60,8 +60,8 @@ def test_what_lies_off_the_source_s_surface() -> None:
     shape = tube()
     off = np.arange(shape.V) < AROUND
     target = Shape(shape.verts * np.where(off[:, None], [1.2, 1, 1.2], 1), shape.faces)
-    assert np.array_equal(beyond(target, shape.verts, shape.faces), off)
-    assert not beyond(target, 1.2 * shape.verts, shape.faces).any()  # a map that is off nearly everywhere
+    assert np.array_equal(find_uncovered(target, shape.verts, shape.faces), off)
+    assert not find_uncovered(target, 1.2 * shape.verts, shape.faces).any()  # a map that is off nearly everywhere
 
 
 def test_a_part_without_weights_goes_with_the_nearest(good: np.ndarray) -> None:
@@ -97,11 +97,11 @@ def test_tears_are_smoothed_and_seams_stay_closed() -> None:
 
 def test_what_is_rigid_goes_with_one_joint(good: np.ndarray) -> None:
     group, nothing = np.arange(100, 400), np.zeros(0, np.int64)
-    found = rigid(csr_array(good), [(group, nothing)]).toarray()
+    found = make_rigid(csr_array(good), [(group, nothing)]).toarray()
     assert np.array_equal(found[group], np.tile(np.eye(3)[good[group].sum(axis=0).argmax()], (300, 1)))
     beside = np.flatnonzero(good[:, 2] == 1)
     assert not np.isin(beside, group).any()
-    assert np.array_equal(rigid(csr_array(good), [(group, beside)]).toarray()[group], np.tile([0, 0, 1], (300, 1)))
+    assert np.array_equal(make_rigid(csr_array(good), [(group, beside)]).toarray()[group], np.tile([0, 0, 1], (300, 1)))
     assert np.array_equal(np.delete(found, group, 0), np.delete(good, group, 0))
 
 

@@ -14,7 +14,16 @@ from meshmatch.errors import InputError, MeshmatchWarning, OptionError
 from meshmatch.shapes.colors import UNKNOWN, label_colors
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
-from meshmatch.transfer.label_files import LABEL_SUFFIXES, Label, Labels, On, labels_of, load_labels, named, save_labels
+from meshmatch.transfer.label_files import (
+    LABEL_SUFFIXES,
+    Label,
+    Labels,
+    On,
+    labels_of,
+    load_labels,
+    name_labels,
+    save_labels,
+)
 from tests.conftest import icosphere
 
 SHAPE = icosphere(1)  # 42 vertices, 80 faces
@@ -232,14 +241,14 @@ def test_the_count_must_be_that_of_what_was_said(tmp_path: Path) -> None:
 def test_blank_has_the_kind_of_the_labels() -> None:
     numbers, words = some("vertices", False), some("vertices", True)
     codes = np.array([0, -1, 2])
-    assert cells(named(codes, numbers, "vertices", None)) == [-4, -1, 17]
-    assert cells(named(codes, numbers, "vertices", "99")) == [-4, 99, 17]
-    assert cells(named(codes, numbers, "vertices", "17")) == [-4, 17, 17]
-    assert cells(named(codes, words, "vertices", None)) == ["left hand", "", "Fuß"]
-    assert cells(named(codes, words, "vertices", "99")) == ["left hand", "99", "Fuß"]
+    assert cells(name_labels(codes, numbers, "vertices", None)) == [-4, -1, 17]
+    assert cells(name_labels(codes, numbers, "vertices", "99")) == [-4, 99, 17]
+    assert cells(name_labels(codes, numbers, "vertices", "17")) == [-4, 17, 17]
+    assert cells(name_labels(codes, words, "vertices", None)) == ["left hand", "", "Fuß"]
+    assert cells(name_labels(codes, words, "vertices", "99")) == ["left hand", "99", "Fuß"]
     for text in ("none", "٣", "1_0"):
         with pytest.raises(OptionError, match=f"--blank {text}: labels are whole numbers"):
-            named(codes, numbers, "vertices", text)
+            name_labels(codes, numbers, "vertices", text)
 
 
 def test_a_suffix_that_cannot_hold_labels_is_refused(tmp_path: Path) -> None:

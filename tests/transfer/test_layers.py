@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from meshmatch.geometry.triangles import cross_product, unit
+from meshmatch.geometry.triangles import cross_product, normalized
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, BakedMaterial, Finish, Layer, Material
-from meshmatch.shapes.formats.gltf_out import smooth_normals
+from meshmatch.shapes.formats.gltf_write import smooth_normals
 from meshmatch.shapes.formats.seams import split_at_seams, vertex_tangents
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.bake import BakeOptions, transfer_texture
@@ -75,7 +75,7 @@ def in_space(shape: Shape, uv: np.ndarray, image: np.ndarray) -> np.ndarray:
     n, t, side = (each[corners].mean(axis=1) for each in (normals, tangents[:, :3], tangents[:, 3:]))
     middle = np.floor(uv.mean(axis=1) * image.shape[0]).astype(int)
     x, y, z = (image[middle[:, 1], middle[:, 0], :3] / 127.5 - 1).T[:, :, None]
-    return unit(x * t + y * side * cross_product(unit(n), unit(t)) + z * n)
+    return normalized(x * t + y * side * cross_product(normalized(n), normalized(t)) + z * n)
 
 
 def test_normals_look_the_same_in_another_atlas_and_pose() -> None:
@@ -83,7 +83,7 @@ def test_normals_look_the_same_in_another_atlas_and_pose() -> None:
     ball = icosphere(3)
     first, second = unwrapped(ball, 512, 4), unwrapped(Shape(ball.verts[:, [1, 2, 0]], ball.faces, "b"), 512, 4)
     y, x = np.mgrid[:512, :512] / 512
-    bumps = unit(np.stack([0.6 * np.sin(9 * x), 0.6 * np.cos(7 * y), np.ones_like(x)], -1).reshape(-1, 3))
+    bumps = normalized(np.stack([0.6 * np.sin(9 * x), 0.6 * np.cos(7 * y), np.ones_like(x)], -1).reshape(-1, 3))
     image = np.full((512, 512, 4), 255, np.uint8)
     image[..., :3] = np.round(127.5 + 127.5 * bumps.reshape(512, 512, 3))
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch.api.measure import own_points
+from meshmatch.api.measure import measuring_points
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
@@ -265,7 +265,7 @@ def test_a_girth_needs_a_surface_that_its_plane_cuts() -> None:
 
 def test_the_body_has_the_measurements_of_a_person() -> None:
     """In meters: what its maker read off sections of the template."""
-    points = own_points("body")
+    points = measuring_points("body")
     found = taken(points)
     assert len(found.names) == 30
     values = dict(zip(found.names, 100 * found.values, strict=True))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
 
-from meshmatch.geometry.triangles import flat_areas, triangle_areas
+from meshmatch.geometry.triangles import planar_areas, triangle_areas
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer import chart_regions as chart_regions_module
 from meshmatch.transfer import hinged_charts
@@ -106,7 +106,7 @@ def test_a_smooth_surface_needs_few_charts(torus: Shape) -> None:
     for chart in charts:
         laid = chart.uv[chart.corners]
         assert (np.linalg.det(np.diff(laid, axis=1)) > 0).all()
-        assert flat_areas(laid).sum() == pytest.approx(areas[chart.members].sum(), rel=1e-6)
+        assert planar_areas(laid).sum() == pytest.approx(areas[chart.members].sum(), rel=1e-6)
 
 
 def test_borders_on_fine_surfaces_are_smoothed_by_way_of_a_copy_between(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +130,7 @@ def test_borders_on_fine_surfaces_are_smoothed_by_way_of_a_copy_between(monkeypa
 
 def test_charts_fill_the_image(torus: Shape) -> None:
     uv = new_charts(scaled(torus), torus.faces, 1024, 4)
-    assert flat_areas(uv).sum() > 0.55
+    assert planar_areas(uv).sum() > 0.55
     assert draw_triangles(uv * 2048, 2048)[1] == 0
 
 
@@ -141,7 +141,7 @@ def test_loose_triangles_end_soon() -> None:
     faces = np.arange(9000).reshape(-1, 3)
     uv = new_charts(scaled(Shape(verts, faces)), faces, 1024, 8)
     assert uv.min() >= 0 and uv.max() <= 1
-    assert (flat_areas(uv) > 0).all()
+    assert (planar_areas(uv) > 0).all()
     assert draw_triangles(uv * 4096, 4096)[1] == 0
 
 

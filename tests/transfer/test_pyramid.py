@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from meshmatch.shapes.appearance import Material, Wrap
-from meshmatch.shapes.colors import LINEAR_OF_BYTE, to_linear, to_srgb
+from meshmatch.shapes.colors import BYTE_TO_LINEAR, to_linear, to_srgb
 from meshmatch.transfer.texels import Pyramid, fill, wrap_index
 from tests.shapes.painted import quarters
 
@@ -134,7 +134,7 @@ def test_a_wide_step_sees_the_mean() -> None:
     for footprint in (2.0, 3.0, 4.0, 1000.0):
         np.testing.assert_allclose(look(pyramid, 0.3, 0.1, footprint), [half, half, half, 1], atol=3e-3)
     # between two levels: half of the logarithm is half of the way; at a center of the largest level
-    want = float(to_srgb(0.5 * 1.0 + 0.5 * float(LINEAR_OF_BYTE[188])))
+    want = float(to_srgb(0.5 * 1.0 + 0.5 * float(BYTE_TO_LINEAR[188])))
     assert look(pyramid, 0.125, 0.125, 2**0.5)[0] == pytest.approx(want, abs=5e-3)
 
 

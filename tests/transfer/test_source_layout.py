@@ -8,7 +8,7 @@ import pytest
 
 import meshmatch
 from meshmatch.errors import InputError, OptionError
-from meshmatch.geometry.triangles import flat_areas
+from meshmatch.geometry.triangles import planar_areas
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.files import load_shape
@@ -57,7 +57,7 @@ def test_a_finer_mesh_gets_the_points_between(ball: tuple[Shape, Appearance]) ->
     fine, _, back = split(shape)
     uv, _ = source_layout(shape, look, fine, back)
     assert uv.shape == (fine.F, 3, 2)
-    assert flat_areas(uv).sum() == pytest.approx(flat_areas(look.uv).sum(), rel=1e-3)
+    assert planar_areas(uv).sum() == pytest.approx(planar_areas(look.uv).sum(), rel=1e-3)
     assert shared_texels(uv) < 1e-3
 
 
@@ -67,11 +67,11 @@ def test_no_triangle_spans_two_charts_of_the_source(ball: tuple[Shape, Appearanc
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     other = Shape(shape.verts @ (turn * np.sign(np.linalg.det(turn))), shape.faces, "other")
     uv, _ = source_layout(shape, look, other, nearest(other, shape))
-    density = np.sqrt(flat_areas(look.uv).sum() / shape.area)
+    density = np.sqrt(planar_areas(look.uv).sum() / shape.area)
     edges = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
     long = np.linalg.norm(other.verts[other.faces] - np.roll(other.verts[other.faces], -1, axis=1), axis=2)
     assert (edges < 2.5 * density * long).all()
-    share = flat_areas(uv) / (density**2 * other.face_areas)
+    share = planar_areas(uv) / (density**2 * other.face_areas)
     assert np.quantile(share, 0.02) > 0.3 and share.max() < 4
     assert shared_texels(uv) < 0.05
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from meshmatch.errors import InputError, MeshmatchWarning, OptionError
-from meshmatch.shapes.colors import seen
+from meshmatch.shapes.colors import linear_to_srgb_alpha
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.vtk import write_vtp
 from meshmatch.shapes.formats.vtk_xml import point_arrays
@@ -18,7 +18,7 @@ from meshmatch.transfer.label_files import labels_of, save_labels
 from meshmatch.transfer.value_files import (
     Values,
     _make_unique,
-    light_of,
+    linear_colors,
     load_values,
     parse_blank,
     save_colors,
@@ -171,7 +171,7 @@ def painted() -> Shape:
 def test_colors_are_written_as_they_were(tmp_path: Path, suffix: str) -> None:
     shape = painted()
     path = tmp_path / f"c{suffix}"
-    save_colors(path, shape, seen(light_of(shape)))
+    save_colors(path, shape, linear_to_srgb_alpha(linear_colors(shape)))
     assert shape.colors is not None
     table = suffix in (".npy", ".csv")
     found = load_values(path, shape).numbers if table else load_shape(path).colors
@@ -184,13 +184,13 @@ def test_gltf_holds_light_and_the_others_colors(tmp_path: Path) -> None:
     """Middle grey on a screen, 188 of 255, is half the light of white."""
     grey = np.full((SHAPE.V, 4), 0.5)
     grey[:, 3] = 1
-    save_colors(tmp_path / "c.glb", SHAPE, seen(grey))
-    save_colors(tmp_path / "c.ply", SHAPE, seen(grey))
+    save_colors(tmp_path / "c.glb", SHAPE, linear_to_srgb_alpha(grey))
+    save_colors(tmp_path / "c.ply", SHAPE, linear_to_srgb_alpha(grey))
     for name in ("c.glb", "c.ply"):
         again = load_shape(tmp_path / name)
         assert again.colors is not None
         assert np.abs(again.colors[:, :3] - 188 / 255).max() < 0.003  # read, both are as a screen has them
-        assert np.abs(light_of(again) - grey).max() < 0.005
+        assert np.abs(linear_colors(again) - grey).max() < 0.005
     import trimesh
 
     stored: Any = trimesh.load(tmp_path / "c.glb", force="mesh")  # as the file has them
@@ -200,7 +200,7 @@ def test_gltf_holds_light_and_the_others_colors(tmp_path: Path) -> None:
 def test_no_colors_is_told_with_what_to_do(tmp_path: Path) -> None:
     save_shape(tmp_path / "a.ply", SHAPE)
     with pytest.raises(InputError, match=r"a\.ply has no vertex colors") as told:
-        light_of(load_shape(tmp_path / "a.ply"))
+        linear_colors(load_shape(tmp_path / "a.ply"))
     assert "--values" in told.value.hint
 
 

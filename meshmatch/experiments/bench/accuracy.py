@@ -190,19 +190,19 @@ def main(
     output: Annotated[Path | None, Option(help="keep fits and maps in this folder, and go on with those there")] = None,
     curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
 ) -> runner.Report:
-    benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
+    benches = [load_set(name, data) for name in runner.split_names(sets, ALL_SETS, "set")]
     weights = model if model == NO_MODEL else as_model(model).card.weights_sha256  # a wrong name would cost every pair
     if output is not None:
         asked = {"weights": weights, "refine": refine, "seed": seed, "threads": threads}
         asked |= {"quick": True} if quick else {}
-        runner.once(output / "asked.json", asked, lambda: runner.circumstances(threads, jobs))
+        runner.cached(output / "asked.json", asked, lambda: runner.run_metadata(threads, jobs))
     fits, made = (None, None) if output is None else (output / "fits", output / "maps")
     method: Method = OurMethod(model, refine, seed, threads=threads, kept=fits, quick=quick)
     if model == NO_MODEL:
         method = DirectMethod(seed, threads)
     runs: list[SetRun] = []
     for bench in benches:
-        pairs = runner.spread(bench.pairs, limit_pairs)
+        pairs = runner.evenly_spread(bench.pairs, limit_pairs)
         runs.append(run_set(bench, method, pairs, cache=cache, jobs=jobs, threads=threads, kept=made))
     scores = [each.scores for each in runs]
     if curve is not None:

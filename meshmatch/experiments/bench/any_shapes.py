@@ -32,7 +32,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 from typer import Option
 
-from meshmatch.api.inputs import usable
+from meshmatch.api.inputs import repair_allowing_parts
 from meshmatch.api.matcher import Matcher
 from meshmatch.api.results import maps_of_fits
 from meshmatch.arrays import Float, Floats, Int, Ints
@@ -40,12 +40,12 @@ from meshmatch.errors import InputError
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.baselines import METHODS, Baseline, Choices
 from meshmatch.experiments.bench.methods import EarlierVersion, Method
-from meshmatch.fitting.alike import match_alike
 from meshmatch.fitting.direct import DirectMatch, match_either_side
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import DIRECT, DIRECT_BOTH_WAYS, DirectCalibration
 from meshmatch.fitting.judge.direct import judge_direct
 from meshmatch.fitting.one_way import DirectConfig
+from meshmatch.fitting.same_pose import refine_match
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.render.compose import compose_match
@@ -177,7 +177,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
     if model != NO_MODEL:
         mapped = Matcher(model, FitConfig(seed=seed), threads=1).match(source, target).map
         return _row(folder, pair, mapped) | {"cpu": time.process_time() - began}
-    clean = usable(source), usable(target)
+    clean = repair_allowing_parts(source), repair_allowing_parts(target)
 
     def row(found: DirectMatch) -> dict[str, Any]:
         fits = replace(found.source, repaired=clean[0]), replace(found.target, repaired=clean[1])
@@ -190,7 +190,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
 
     shapes = clean[0].shape, clean[1].shape
     roughly = match_either_side(*shapes, DirectConfig(seed=seed))
-    found = match_alike(*shapes, roughly, FitConfig(seed=seed))
+    found = refine_match(*shapes, roughly, FitConfig(seed=seed))
     best = row(found) | {"cpu": time.process_time() - began, "finer": found.reasons != roughly.reasons}
     return best | {"one_way": None if found.before is None else row(found.before)}
 
@@ -334,9 +334,9 @@ def _beside(
     found: _Found, methods: str, earlier: Path | None, limit: int, data: Path, work: Path | None, seed: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """A row for each of some other methods on some pairs of each class, and for this one; and which could not run."""
-    some = {name: runner.spread(rows, limit) for name, rows in found.items()}
+    some = {name: runner.evenly_spread(rows, limit) for name, rows in found.items()}
     rows, missing = [{"method": "ours", "failed": 0, **_beside_row(_all(some))}], []
-    others = {name: METHODS[name](Choices(seed=seed))[0] for name in runner.names_of(methods, METHODS, "method")}
+    others = {name: METHODS[name](Choices(seed=seed))[0] for name in runner.split_names(methods, METHODS, "method")}
     if earlier is not None:
         label = f"fit --model none of {runner.commit(earlier)}"
         others["earlier"] = Baseline("earlier", label, EarlierVersion(earlier))
@@ -351,7 +351,7 @@ def _beside(
                 first, _, second = pair.partition(" to ")
                 call = partial(measure_by, baseline.method, folder, (first, second))
                 asked = {"method": name, "seed": seed}
-                measured.append(runner.at_work(work, f"{kind}-{first}-{second}-{name}", asked, call))
+                measured.append(runner.cached_in(work, f"{kind}-{first}-{second}-{name}", asked, call))
         failed = sum(row["failed"] for row in measured)
         rows.append({"method": baseline.label, "failed": failed, **_beside_row(measured)})
     return rows, missing
@@ -378,15 +378,15 @@ def main(
     limit_beside: Annotated[int, Option(min=1, help="pairs of each class that they are measured on")] = 12,
     draw: Annotated[Path | None, Option(help="draw the worst pair of each class into this PNG")] = None,
 ) -> runner.Report:
-    names = CLASSES if classes == "all" else runner.names_of(classes, (*CLASSES, *TURNING), "class")
+    names = CLASSES if classes == "all" else runner.split_names(classes, (*CLASSES, *TURNING), "class")
     found: dict[str, list[dict[str, Any]]] = {}
     asked = {"model": model, "seed": seed}
     for name in names:
         folder = folder_of(name, data)
-        pairs = runner.spread(list(permutations(shapes_of(folder), 2)), limit_pairs)
+        pairs = runner.evenly_spread(list(permutations(shapes_of(folder), 2)), limit_pairs)
         found[name] = []
         for pair in runner.track(pairs, name):
-            row = runner.at_work(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
+            row = runner.cached_in(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
             found[name].append(judged(row))
     everything = _all(found)
     rows = [*(row_of(name, some) for name, some in found.items()), row_of("all", everything)]

@@ -118,7 +118,7 @@ def measured(row: Baseline, bench: BenchSet, folder: Path, limit: int | None, **
     InputError
         The file in the folder is damaged.
     """
-    pairs = runner.spread(bench.pairs, limit)
+    pairs = runner.evenly_spread(bench.pairs, limit)
     path = folder / f"{bench.name}-{row.name}.json"
     settings = {key: str(value) for key, value in vars(row.method).items()}
     asked = {"method": row.name, "set": bench.name, "pairs": pairs, "settings": settings, "model": row.model}
@@ -129,12 +129,12 @@ def measured(row: Baseline, bench: BenchSet, folder: Path, limit: int | None, **
         scores = run_set(bench, row.method, pairs, **how).as_dict()
         scores.pop("fits")
         return {
-            **runner.circumstances(how.get("threads", 1), how.get("jobs", 1)),
+            **runner.run_metadata(how.get("threads", 1), how.get("jobs", 1)),
             **{"of": len(bench.pairs), "minutes": row.minutes},
             **{"seconds": round(time.perf_counter() - began, 1), "scores": scores},
         }
 
-    return runner.once(path, asked, measure)
+    return runner.cached(path, asked, measure)
 
 
 @runner.command
@@ -152,9 +152,9 @@ def main(
     threads: runner.Threads = 1,
     cache: runner.Cache = None,
 ) -> runner.Report:
-    benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
+    benches = [load_set(name, data) for name in runner.split_names(sets, ALL_SETS, "set")]
     choices = Choices(model, coded_model, coded_steps, seed, threads)
-    known = [row for name in runner.names_of(methods, METHODS, "method") for row in METHODS[name](choices)]
+    known = [row for name in runner.split_names(methods, METHODS, "method") for row in METHODS[name](choices)]
     make_folder(output)
     rows, skipped = [], {}
     for bench in benches:
@@ -162,7 +162,7 @@ def main(
             if row.method is None:
                 skipped[row.label] = row.missing
                 continue
-            runner.tell(f"{row.label} on {bench.name}")
+            runner.log(f"{row.label} on {bench.name}")
             found = measured(row, bench, output, limit_pairs, cache=cache, jobs=jobs, threads=threads)
             names = {"set": bench.name, "name": row.name, "label": row.label}
             scores = found["scores"]

@@ -35,10 +35,10 @@ from meshmatch.experiments.bench.verdicts import REFUSED, VERDICTS
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.bodies import draw_identities, pose_limbs, template_rig
-from meshmatch.generators.clothes import dressed, skirted
+from meshmatch.generators.clothes import add_clothes, add_skirts
 from meshmatch.generators.figure import Figure
 from meshmatch.generators.limbs import Draw, Limbs
-from meshmatch.generators.proportions import TOON, draw_style, rounded, stretched
+from meshmatch.generators.proportions import TOON, draw_style, round_parts, scale_bones
 from meshmatch.generators.rig import forward_kinematics, penetration, skin
 from meshmatch.generators.rotations import DEGREE, rotation_from_vector
 from meshmatch.geometry.trees import cKDTree
@@ -151,11 +151,11 @@ class People:
         worn = str(rng.choice(["naked", "clothed", "skirt"], p=[0.4, 0.4, 0.2]))
         kind = ("", "child, ", "stretched, ", "stylised, ")[int(style.kind)]
         if kind:
-            rest, heads = stretched(figure, rest, heads, style)
+            rest, heads = scale_bones(figure, rest, heads, style)
         if int(style.kind) >= TOON:
-            rest = rounded(figure, rest, heads, style.kind, generator)
+            rest = round_parts(figure, rest, heads, style.kind, generator)
         if worn != "naked":
-            rest = dressed(figure, rest, heads, generator)
+            rest = add_clothes(figure, rest, heads, generator)
         many = heads.repeat(_TRIES, 1, 1)
         world, offset = forward_kinematics(rig, many, self._angles(pose, many, rng, generator))
         best = int(penetration(rig, many, world, offset).argmin())
@@ -163,7 +163,7 @@ class People:
         verts = skin(rig, rest, world, offset)
         if worn == "skirt":
             joints = (world @ heads[..., None])[..., 0] + offset
-            verts = skirted(figure, verts, heads, joints, generator)
+            verts = add_skirts(figure, verts, heads, joints, generator)
         return verts[0].double().numpy(), kind + worn
 
     def _angles(
@@ -311,7 +311,7 @@ def main(
         row["seconds"] = time.process_time() - began
         rows.append(row)
         with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(runner.plain(row)) + "\n")
+            file.write(json.dumps(runner.to_json(row)) + "\n")
     found, poses = counted(rows), by_pose(rows)
     refused = sum(row["verdict"] == REFUSED for row in rows)
     columns = {"error": "error"} | {name: f"{name}:d" for name in (*VERDICTS, "all")}

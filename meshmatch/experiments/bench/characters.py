@@ -23,7 +23,7 @@ from meshmatch.experiments import runner
 from meshmatch.experiments.bench.pairs import VERDICTS, matched
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import ordered_pairs
-from meshmatch.experiments.makers.character_designs import Character, people, touching
+from meshmatch.experiments.makers.character_designs import Character, clothed_people, people_in_contact
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.generators.proportions import BUILT, CHILD, PLAIN, TOON
 from meshmatch.maps.evaluate import CM_PER_UNIT
@@ -83,11 +83,11 @@ def main(
     seed: runner.Seed = 0,
 ) -> runner.Report:
     matcher, template, rows = Matcher(model, FitConfig(), threads), read_template("human-T"), []
-    for group in runner.names_of(groups, GROUPS, "group"):
+    for group in runner.split_names(groups, GROUPS, "group"):
         if group in KINDS:
-            made = people(template, count, KINDS[group], seed, group)
+            made = clothed_people(template, count, KINDS[group], seed, group)
         else:
-            made = touching(template, count, seed, group, CONTACTS[group])
+            made = people_in_contact(template, count, seed, group, CONTACTS[group])
         turns = Rotation.random(count, random_state=np.random.default_rng([seed, 3])).as_matrix()
         cast = [
             replace(each, shape=replace(each.shape, verts=each.shape.verts @ turn.T))

@@ -97,10 +97,10 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
     model, details = model or (NO_MODEL if name == HEART else "human"), {}
     if name == HEART:
         shapes, truth = load_folder(data / HEART, TRUTH)
-        paths = [data / HEART / f"{each}.ply" for each in runner.spread(list(shapes), limit)]
+        paths = [data / HEART / f"{each}.ply" for each in runner.evenly_spread(list(shapes), limit)]
     else:
         bench = load_set(name, data)
-        paths = [bench.path(each) for each in runner.spread(list(bench.shapes), limit)]
+        paths = [bench.path(each) for each in runner.evenly_spread(list(bench.shapes), limit)]
     one, two = work / f"{name}-1", work / f"{name}-2"
     seconds = {folder: timed_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # of all processes so far
@@ -144,7 +144,7 @@ def main(
     work: Annotated[Path | None, Option(help="keep fits and maps in this new folder")] = None,
 ) -> runner.Report:
     """Fit, agree and map whole sets."""
-    asked = runner.names_of(sets, SETS, "set")
+    asked = runner.split_names(sets, SETS, "set")
     with tempfile.TemporaryDirectory() as folder:
         rows = [measure(name, data, work or Path(folder), limit_shapes, model) for name in asked]
     title = f"Collections, {os.cpu_count()} cores, one thread a process"

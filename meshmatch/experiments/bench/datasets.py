@@ -130,7 +130,7 @@ def main(
 ) -> runner.Report:
     rows: list[dict[str, Any]] = []
     wrong: list[str] = []
-    for name in runner.names_of(sets, CHECKS, "set"):
+    for name in runner.split_names(sets, CHECKS, "set"):
         published, look = CHECKS[name]
         row = {"set": name, "published": published}
         try:

@@ -190,7 +190,7 @@ def main(
 ) -> runner.Report:
     garments = {file.stem: Bound.read(file) for file in runner.files_in(data / "garments", "*.mhclo")}
     matcher = None if exact_map else Matcher(model, FitConfig(), threads)
-    chosen: list[Any] = runner.names_of(poses, get_args(Pose), "pose")
+    chosen: list[Any] = runner.split_names(poses, get_args(Pose), "pose")
     rows = [row for pose in chosen for row in rows_of(garments, pose, count, matcher, seed)]
     title = f"Garments from person to person with {'the true map' if exact_map else model}"
     return runner.Report({"rows": rows}, [runner.table(title, rows, COLUMNS)])

@@ -25,12 +25,12 @@ from typer import Option
 from meshmatch.arrays import Floats, Ints
 from meshmatch.experiments import runner
 from meshmatch.fitting.fitter import boundary_length
-from meshmatch.maps.parts import kept_together
+from meshmatch.maps.parts import match_parts
 from meshmatch.maps.places import Places
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.formats.gltf_attributes import read_skin
-from meshmatch.shapes.outside import without_hidden
+from meshmatch.shapes.hidden_faces import remove_hidden_faces
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
@@ -62,7 +62,7 @@ def loose(n: int, gap: float = 0.0) -> Shape:
 def judged(shape: Shape) -> object:
     """Repaired, and asked what a fit asks before it begins."""
     clean = repair(shape).shape
-    return boundary_length(clean), without_hidden(clean)
+    return boundary_length(clean), remove_hidden_faces(clean)
 
 
 def holes(n: int, _: Path) -> Step:
@@ -104,7 +104,7 @@ def parts_to_parts(n: int, _: Path) -> Step:
         )
 
     source, target = places("a", 0.0), places("b", 0.01)
-    return lambda: kept_together(source, target, target.nearest(source.resting))
+    return lambda: match_parts(source, target, target.nearest(source.resting))
 
 
 def scene(path: Path, nodes: list[dict[str, Any]], **more: Any) -> Path:
@@ -234,7 +234,7 @@ def main(
 ) -> runner.Report:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for name in runner.track(runner.names_of(steps, STEPS, "step"), "running"):
+        for name in runner.track(runner.split_names(steps, STEPS, "step"), "running"):
             row: dict[str, Any] = {"step": name}
             STEPS[name](10, Path(folder))()  # what is loaded once is not counted
             for count in [count for count in COUNTS if count <= most]:

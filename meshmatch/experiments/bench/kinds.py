@@ -108,7 +108,7 @@ def geodesic_errors(
 def animals(data: Path, limit: int | None, cache: Path | None) -> Subjects:
     """Those of the evaluation data."""
     shapes, truth = load_folder(data / "animal", TRUTH)
-    shapes = {name: shapes[name] for name in runner.spread(list(shapes), limit)}
+    shapes = {name: shapes[name] for name in runner.evenly_spread(list(shapes), limit)}
     groups: dict[str, Group] = {"species": lambda pair: " to ".join(map(species_of, pair))}
     return Subjects("error x 100 / sqrt(area)", shapes, partial(geodesic_errors, shapes, truth, cache), groups)
 
@@ -168,7 +168,7 @@ def main(
 ) -> runner.Report:
     record: dict[str, Any] = {}
     tables: list[Table] = []
-    for name in runner.names_of(sets, SETS, "set"):
+    for name in runner.split_names(sets, SETS, "set"):
         matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
         subjects = animals(data, limit_shapes, cache) if name == "animals" else cut_scans(name, scans, seed, cache)
         record[name], some = measured(name, subjects, matcher, limit_pairs, model == NO_MODEL)

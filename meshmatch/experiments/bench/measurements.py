@@ -17,7 +17,7 @@ import numpy as np
 from typer import Option
 
 import meshmatch
-from meshmatch.api.measure import BODY, own_points
+from meshmatch.api.measure import BODY, measuring_points
 from meshmatch.arrays import Float, Floats
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.sets import BenchSet, load_set
@@ -43,7 +43,7 @@ def people_of(name: str, shapes: Iterable[str]) -> dict[str, list[str]]:
 
 def measured(bench: BenchSet, shapes: list[str], matcher: meshmatch.Matcher, body: meshmatch.Fit) -> list[list[Floats]]:
     """(2, N) for each shape: measurements by `measure`, and by the true correspondences from the first shape."""
-    points, found = own_points(BODY), []
+    points, found = measuring_points(BODY), []
     first = bench.shape(shapes[0])
     places = None
     for name in runner.track(shapes, f"people of {bench.name}"):
@@ -103,14 +103,14 @@ def main(
     limit_shapes: Annotated[int | None, Option(min=2, help="scans of each person, evenly spread")] = None,
     threads: runner.Threads = 1,
 ) -> runner.Report:
-    matcher, points = meshmatch.Matcher("human"), own_points(BODY)
+    matcher, points = meshmatch.Matcher("human"), measuring_points(BODY)
     body = matcher.fit(points.shape)
     names = [each.name for each in points.measurements]
     rows: list[dict[str, Any]] = []
-    for name in runner.names_of(sets, ("faust", "scape"), "set"):
+    for name in runner.split_names(sets, ("faust", "scape"), "set"):
         bench = load_set(name, data)
         people = [
-            np.array(measured(bench, runner.spread(own, limit_shapes), matcher, body))
+            np.array(measured(bench, runner.evenly_spread(own, limit_shapes), matcher, body))
             for own in people_of(name, bench.shapes).values()
         ]
         for each in dict.fromkeys(map(_name, names)):

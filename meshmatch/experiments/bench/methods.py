@@ -20,7 +20,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.inputs import as_model, repair_or_raise
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
@@ -35,9 +35,9 @@ from meshmatch.maps.footpoints import Surface
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
+from meshmatch.shapes.alignment import align, sqrt_area_frame
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.normalise import align, sqrt_area_frame
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -81,7 +81,7 @@ class OurMethod:
         """Fit the model's template to the shape; `MeshmatchError` of a kept fit of another template, or a damaged one."""
         path = None if self.kept is None else self.kept / f"{shape.hash}.safetensors"
         if path is not None and path.is_file():
-            known, clean = read_fit(path, as_model(self.model).template), validated(shape)
+            known, clean = read_fit(path, as_model(self.model).template), repair_or_raise(shape)
             return replace(known.fit, verts=clean.shape.verts, repaired=clean, seconds=float(known.words["seconds"]))
         fit = self._matcher().fit(shape)
         if path is not None:

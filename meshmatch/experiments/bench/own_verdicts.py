@@ -6,8 +6,8 @@ fit is right if its maps to and from the sound specimens miss by less than a ten
 otherwise, as that of another shape always is.
 
 A row counts verdicts by weights that other collections gave: those of generated shapes, without its own; ``--fit`` prints
-what all generated ones give, as `meshmatch.fitting.usual` keeps them. Beside them, "as they are", the verdicts that
-users see.
+what all generated ones give, as `meshmatch.fitting.reference_statistics` keeps them. Next to them, "as they are", are the
+verdicts that users see.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from typer import Option
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.collections.collection import Collection
 from meshmatch.collections.compare import Compared
-from meshmatch.collections.setting import ALONE, SUFFIX, Record
+from meshmatch.collections.setting import SINGLE_FITS, SUFFIX, Record
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.specimens import SETS, SIDED, Specimens, collected, scanned, wholes
-from meshmatch.experiments.makers.molars_and_leaves import MAKERS, varied
+from meshmatch.experiments.makers.molars_and_leaves import MAKERS, deform_randomly
 from meshmatch.fitting.fit import Fit
-from meshmatch.fitting.usual import Weights
-from meshmatch.maps.fit_files import load_words, read_fit
+from meshmatch.fitting.reference_statistics import Weights
+from meshmatch.maps.fit_files import read_fit, read_fit_header
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.files import save_shape
@@ -64,7 +64,7 @@ def spoiled(name: str, data: Path, count: int, seed: int) -> Spoiled:
         what = IN_FIVE[number % len(IN_FIVE)]
         unit = float(np.sqrt(whole.area))
         if what == "warped":
-            verts = varied(whole.verts, rng.uniform(0.05, 0.25) * unit, 0.3 * unit, rng)
+            verts = deform_randomly(whole.verts, rng.uniform(0.05, 0.25) * unit, 0.3 * unit, rng)
             whole = Shape(verts, whole.faces, whole.name)
         if what == "replaced":
             other = others[number % len(others)]
@@ -107,8 +107,8 @@ class Alone:
     def read(cls, folder: Path) -> Alone:
         """Of a folder of fits."""
         collection = Collection(folder)
-        paths = {name: folder / ALONE / f"{name}{SUFFIX}" for name in collection.names}
-        records = {name: Record.of(load_words(path)[1]["record"]) for name, path in paths.items()}
+        paths = {name: folder / SINGLE_FITS / f"{name}{SUFFIX}" for name in collection.names}
+        records = {name: Record.of(read_fit_header(path)[1]["record"]) for name, path in paths.items()}
         usual = Compared.of(list(records.values()))
         assert usual is not None
         fits = {name: read_fit(path, collection.template).fit for name, path in paths.items()}
@@ -167,14 +167,14 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names = runner.names_of(collections, OTHER, "collection")
+    names = runner.split_names(collections, OTHER, "collection")
     with tempfile.TemporaryDirectory() as temporary:
         place, asked = work or Path(temporary), {"count": count, "seed": seed}
         found, alone = {}, {}
         for name in names:
-            runner.tell(name)
+            runner.log(name)
             call = partial(measure, name, data, count, seed, place)
-            found[name] = runner.once(place / "rows" / f"{name}.json", asked, call)["fits"]
+            found[name] = runner.cached(place / "rows" / f"{name}.json", asked, call)["fits"]
             alone[name] = Alone.read(place / "fits" / name)
     signs = {name: alone[name].signs(found[name]) for name in names if name in MAKERS}
 

@@ -29,7 +29,7 @@ from meshmatch.experiments.bench.scores import TruthDistances, area_under_curve,
 from meshmatch.experiments.bench.sets import SET_NAMES, BenchSet, load_set
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import Partial
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.maps.evaluate import LOST_CM, Errors
 from meshmatch.render.scene import Scene
 from meshmatch.render.surface import Surface, face_paint
@@ -62,10 +62,10 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_p
 
 def seen_faces(shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, " 3"]) -> Bool[Bools, " F"]:
     """Whether a camera far away in a direction sees the middle of each face."""
-    facing = unit(shape.face_vectors) @ direction > 0
+    facing = normalized(shape.face_vectors) @ direction > 0
     white = face_paint(np.ones((shape.F, 3)))
     scene = Scene([Surface(shape.verts, shape.faces, np.zeros_like(shape.verts), white)])
-    lifted = (centers + 1e-4 * shape.diagonal * unit(shape.face_vectors)).astype(np.float32)
+    lifted = (centers + 1e-4 * shape.diagonal * normalized(shape.face_vectors)).astype(np.float32)
     towards = np.broadcast_to(direction.astype(np.float32), lifted.shape)
     return np.asarray(facing & ~scene.blocked(lifted, towards, 2 * shape.diagonal))
 
@@ -106,9 +106,9 @@ def measure(
         errors = truth.errors([answers])[0][left]
         return {"errors": errors, "confidence": found.assumed_confidence[at], "partial": fit.partial}
 
-    pairs = runner.spread(bench.pairs, limit)
+    pairs = runner.evenly_spread(bench.pairs, limit)
     results = [
-        runner.at_work(work, f"{bench.name}-{kind}-{source}-{target}", asked, bound(matched, source, target))
+        runner.cached_in(work, f"{bench.name}-{kind}-{source}-{target}", asked, bound(matched, source, target))
         for source, target in runner.track(pairs, f"{bench.name}: {kind}")
     ]
     errors = [Errors(np.array(each["errors"])) for each in results]
@@ -136,7 +136,7 @@ def main(
     cache: runner.Cache = None,
     work: runner.Work = None,
 ) -> runner.Report:
-    benches = [load_set(name, data) for name in runner.names_of(sets, SET_NAMES, "set")]
+    benches = [load_set(name, data) for name in runner.split_names(sets, SET_NAMES, "set")]
     methods = OurMethod(model, seed=seed), OurMethod(model, seed=seed, partial=partial)
     asked = {"weights": as_model(model).card.weights_sha256, "seed": seed, "partial": partial}
     rows = [measure(bench, kind, *methods, limit_pairs, cache, work, asked) for bench in benches for kind in KINDS]

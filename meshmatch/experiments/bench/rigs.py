@@ -193,9 +193,9 @@ def main(
     for folder in folders.split(","):
         files = runner.files_in(data / "rigs" / folder, _PATTERNS.get(folder, "*.glb"), 2)
         cast, matcher = {file.stem: _Character(file) for file in files}, Matcher(threads=threads)
-        pairs = runner.spread(ordered_pairs(cast), limit_pairs)
+        pairs = runner.evenly_spread(ordered_pairs(cast), limit_pairs)
         each[folder] = [
-            runner.at_work(work, f"{folder}-{a}-{b}", {}, partial(measured, cast[a], cast[b], matcher))
+            runner.cached_in(work, f"{folder}-{a}-{b}", {}, partial(measured, cast[a], cast[b], matcher))
             for a, b in runner.track(pairs, folder)
         ]
         rows.append(row_of(folder, each[folder]))

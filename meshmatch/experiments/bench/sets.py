@@ -30,7 +30,7 @@ import numpy as np
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError, OptionError
-from meshmatch.experiments.runner import files_in, spread
+from meshmatch.experiments.runner import evenly_spread, files_in
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 
@@ -157,7 +157,7 @@ def _landmarks(path: Path, every_vertex: bool) -> Int[Ints, " N"]:
 
 def ordered_pairs(names: Iterable[str], limit: int | None = None) -> list[Pair]:
     """All ordered pairs, or so many of them, evenly spread."""
-    return spread(list(permutations(names, 2)), limit)
+    return evenly_spread(list(permutations(names, 2)), limit)
 
 
 def load_folder(folder: Path, suffix: str) -> tuple[dict[str, Shape], Mapping[str, Ints]]:

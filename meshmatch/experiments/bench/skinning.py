@@ -17,7 +17,7 @@ from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.geometry.smoothing import laplacian
 from meshmatch.geometry.triangles import dot, vertex_areas, vertex_normals
 from meshmatch.maps.footpoints import Surface
-from meshmatch.shapes.faces import seams
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.formats.gltf_rig import Rig
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import largest_weights
@@ -102,7 +102,7 @@ def nearest_and_inpainted(
     rows = np.repeat(np.arange(target.V), 3)
     pick = coo_array((foot.barycentric.ravel(), (rows, corners.ravel())), (target.V, source.V)).tocsr()
     nearest = csr_array(pick @ weights)
-    twin = seams(target.verts, target.faces)
+    twin = seam_representatives(target.verts, target.faces)
     normals = vertex_normals(target.verts, twin[target.faces])[twin]
     there = np.einsum("nk,nkd->nd", foot.barycentric, vertex_normals(aligned, source.faces)[corners])
     size = np.linalg.norm(normals, axis=1) * np.linalg.norm(there, axis=1)

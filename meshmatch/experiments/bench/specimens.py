@@ -163,7 +163,7 @@ def by_points(
 def wholes(name: str, data: Path, count: int, seed: int) -> dict[str, Shape]:
     """The shapes of a set in correspondence: femurs, or what is generated."""
     if name == "femurs":
-        files = runner.spread(runner.files_in(data / "femur", "*.ply"), count)
+        files = runner.evenly_spread(runner.files_in(data / "femur", "*.ply"), count)
         return {path.stem: load_shape(path) for path in files}
     found: Registered = MAKERS[name](count, seed)
     return {f"{name}-{k:02d}": Shape(verts, found.faces, name) for k, verts in enumerate(found.verts)}
@@ -175,14 +175,17 @@ def load(name: str, data: Path, count: int, seed: int) -> Specimens:
     mirrored = [name in SIDED and k % 3 == 2 for k in range(max(count, 100))]
     if name in BY_KEYPOINTS:
         folder = any_shapes.folder_of(name, data)
-        names = runner.spread(any_shapes.shapes_of(folder), count)
+        names = runner.evenly_spread(any_shapes.shapes_of(folder), count)
         points = {each: any_shapes.keypoints_of(folder, each) for each in names}
         shapes = {each: load_shape(folder / f"{each}.ply") for each in names}
         made = {each: by_points(shapes[each], points[each], len(points[each]), rng) for each in names}
         return Specimens(made, "% of sqrt(area)", folder)
     if name == "hearts":
         shapes_of, truth = load_folder(data / "heart", ".truth.npy")
-        names, size = runner.spread(list(shapes_of), count), 1 + max(int(each[:, 0].max()) for each in truth.values())
+        names, size = (
+            runner.evenly_spread(list(shapes_of), count),
+            1 + max(int(each[:, 0].max()) for each in truth.values()),
+        )
         made = {}
         for number, each in enumerate(names):
             at = np.full(size, -1)
@@ -324,7 +327,7 @@ def measure(
     done = ways[method](some, scans, place)
     cpu = _cpu() - began
     means, lost, on_cut = {}, [], []
-    for pair in runner.spread(list(permutations(some.each, 2)), limit if method == PAIRS else None):
+    for pair in runner.evenly_spread(list(permutations(some.each, 2)), limit if method == PAIRS else None):
         began = _cpu()
         arrived = done.points(pair)
         cpu += _cpu() - began
@@ -358,17 +361,17 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names, rows = runner.names_of(sets, SETS, "set"), []
-    chosen, skipped = runner.installed(runner.names_of(methods, METHODS, "method"), _OTHERS)
+    names, rows = runner.split_names(sets, SETS, "set"), []
+    chosen, skipped = runner.installed(runner.split_names(methods, METHODS, "method"), _OTHERS)
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
         for method in chosen:
             asked: dict[str, Any] = {"count": count, "seed": seed}
             asked |= {"steps": steps} if method == "own" else {"pairs": limit_pairs} if method == PAIRS else {}
             for name in names:
-                runner.tell(f"{name}: {method}")
+                runner.log(f"{name}: {method}")
                 call = partial(measure, name, method, data, count, steps, limit_pairs, seed, place)
-                rows.append(runner.once(place / "rows" / f"{name}-{method}.json", asked, call))
+                rows.append(runner.cached(place / "rows" / f"{name}-{method}.json", asked, call))
     rows.sort(key=lambda row: names.index(row["set"]))
     title = f"Specimens; own models of {steps} steps"
     return runner.Report({"rows": rows}, [runner.table(title, rows, _COLUMNS)], skipped)

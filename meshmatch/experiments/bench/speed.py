@@ -279,7 +279,7 @@ def main(
     with tempfile.TemporaryDirectory() as folder:
         rows = [
             compared(record_of(name, CASES[name], measure(CASES[name], runs, Path(folder))), before.get(name, {}))
-            for name in runner.track(runner.names_of(cases, CASES, "case"), "running")
+            for name in runner.track(runner.split_names(cases, CASES, "case"), "running")
         ]
     title = f"Whole processes on {kept} cores, median of {runs} runs"
     columns = COLUMNS if against is None else {**COLUMNS, **AGAINST, **RATIOS}

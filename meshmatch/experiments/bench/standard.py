@@ -238,7 +238,7 @@ def main(
     seed: runner.Seed = 0,
 ) -> runner.Report:
     there = [name for name in MODELS if (data / (f"{_REMESHED}/{name}" if name in REMESHED else name)).is_dir()]
-    names = runner.names_of(sets, MODELS, "set") or there
+    names = runner.split_names(sets, MODELS, "set") or there
     if not names:
         raise InputError(f"{data} has none of {', '.join(MODELS)}", "docs/datasets.md says how they are laid out")
     rows = []
@@ -246,9 +246,9 @@ def main(
         began = time.perf_counter()
         split, chosen = split_of(name, data), model or MODELS[name]
         if words := not_published(name, list(split.shapes)):
-            runner.tell(f"warning: {words}")
-        pairs = runner.spread(list(split.pairs), limit_pairs)
-        runner.tell(f"{name}: {len(split.shapes)} shapes, {len(pairs)} pairs")
+            runner.log(f"warning: {words}")
+        pairs = runner.evenly_spread(list(split.pairs), limit_pairs)
+        runner.log(f"{name}: {len(split.shapes)} shapes, {len(pairs)} pairs")
         matcher = Matcher(chosen, FitConfig(seed=seed), threads)
         if chosen == NO_MODEL:
             found = matched_directly(matcher, split.shapes, pairs, name)

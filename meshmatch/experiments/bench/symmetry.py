@@ -38,7 +38,7 @@ from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.files import save_shape
-from meshmatch.templates.sides import laid_mirrored
+from meshmatch.templates.mirror_images import aligned_mirror_image
 
 PYCLARCS = "pyclarcs"
 ALONE = "alone"
@@ -65,7 +65,7 @@ def by_fits(some: Specimens, scans: Path, work: Path) -> Across:
     collection.fit(scans, model=NO_MODEL)
     template = collection.template.shape
     images = template.verts * [-1.0, 1, 1]
-    across = kabsch(images, laid_mirrored(template, 0).verts)
+    across = kabsch(images, aligned_mirror_image(template, 0).verts)
 
     def points(name: str, vertices: Ints) -> Floats:
         places = collection.places_of(name)
@@ -143,14 +143,14 @@ def main(
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names, rows = runner.names_of(sets, SETS, "set"), []
-    chosen, skipped = runner.installed(runner.names_of(methods, METHODS, "method"), (PYCLARCS,))
+    names, rows = runner.split_names(sets, SETS, "set"), []
+    chosen, skipped = runner.installed(runner.split_names(methods, METHODS, "method"), (PYCLARCS,))
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
         for method in chosen:
             for name in names:
-                runner.tell(f"{name}: {method}")
+                runner.log(f"{name}: {method}")
                 call = partial(measure, name, method, data, seed, place)
-                rows.append(runner.once(place / "symmetry" / f"{name}-{method}.json", {"seed": seed}, call))
+                rows.append(runner.cached(place / "symmetry" / f"{name}-{method}.json", {"seed": seed}, call))
     rows.sort(key=lambda row: names.index(row["set"]))
     return runner.Report({"rows": rows}, [runner.table("Across the plane of symmetry", rows, _COLUMNS)], skipped)

@@ -45,7 +45,7 @@ def main(
     files = runner.files_in(data / "topologies", "*.proxy")
     crowd, faces = people(count, seed)
     rows = []
-    for pose in runner.names_of(poses, get_args(Pose), "pose"):
+    for pose in runner.split_names(poses, get_args(Pose), "pose"):
         for file in files:
             bound, found = Bound.read(file), []
             for k in runner.track(range(count), f"{file.stem}, {pose}"):

@@ -19,7 +19,7 @@ from skimage.measure import marching_cubes
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.experiments.bench.partial import seen_faces
-from meshmatch.experiments.makers.character_designs import people
+from meshmatch.experiments.makers.character_designs import clothed_people
 from meshmatch.experiments.makers.fused_surface import fused_with_base
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.generators.generator import Generator
@@ -326,7 +326,7 @@ class Cases:
         drawn, faces = self._casts.setdefault(kind, []), self.template.shape.faces
         corners = np.concatenate([np.arange(self.template.shape.V), faces[:, 0]])  # of the body's other triangles
         while len(drawn) <= number:
-            made = people(self.template, 10, kind, 100 + self.seed + len(drawn))
+            made = clothed_people(self.template, 10, kind, 100 + self.seed + len(drawn))
             drawn += [(each.shape, corners[np.asarray(each.places)]) for each in made]
         return drawn[number]
 

@@ -216,18 +216,18 @@ def of_seed(
     for name in names:
         which = {"kind": kind, "family": name, "count": count, "seed": seed, "targets": _TARGETS}
         path = folder / f"{kind}-{name.replace(' ', '-')}-{seed}.json"
-        kept = runner.once(path, which, partial(family, name))["found"]
+        kept = runner.cached(path, which, partial(family, name))["found"]
         # null is what JSON makes of infinity
         found = [each | {"error": np.inf if each["error"] is None else each["error"]} for each in kept]
         (row,) = rows_of(found, "family", [name])
-        runner.tell(f"{name}, seed {seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
+        runner.log(f"{name}, seed {seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
         yield from found
 
 
 def families_of(kind: str, chosen: str) -> list[str]:
     """Families by their names, or those of a group that the kind has."""
     if chosen not in GROUPS:
-        return runner.names_of(chosen, FAMILIES, "family")
+        return runner.split_names(chosen, FAMILIES, "family")
     return [name for name in GROUPS[chosen] if kind == "human" or name not in OF_PEOPLE]
 
 

@@ -21,7 +21,7 @@ from typing import IO
 
 import numpy as np
 
-from meshmatch.errors import LONGEST, MeshmatchError, MeshmatchWarning, visible
+from meshmatch.errors import MAX_MESSAGE_LENGTH, MeshmatchError, MeshmatchWarning, visible
 from meshmatch.experiments.hostile.damage import apply_damage
 from meshmatch.experiments.hostile.learned import trainers, update_hashes
 from meshmatch.experiments.hostile.readers import BadMessage, readers
@@ -95,7 +95,9 @@ def judge(family: str, path: Path, shape: Shape, printed: IO[bytes]) -> tuple[st
         except MeshmatchError as error:
             if "allocate" in error.message:
                 kind, what = "memory", error.message
-            elif max(len(error.message), len(error.hint)) > LONGEST or visible(error.message) != error.message:
+            elif (
+                max(len(error.message), len(error.hint)) > MAX_MESSAGE_LENGTH or visible(error.message) != error.message
+            ):
                 kind, what = "message", error.message
         except BadMessage as error:
             kind, what = "message", str(error)

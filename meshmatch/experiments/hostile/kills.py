@@ -32,7 +32,7 @@ from meshmatch.models.card import IMPLICIT
 from meshmatch.models.registry import HOME_VARIABLE
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 
@@ -109,7 +109,7 @@ def make_cases(folder: Path, training: bool) -> list[Case]:  # noqa: C901
     def texture(place: Path) -> None:
         paint = np.random.default_rng(0).integers(0, 256, (64, 64, 4)).astype(np.uint8)
         uv = np.random.default_rng(1).random((shape.F, 3, 2))
-        save_textured(place / "a.obj", Textured(shape.verts, shape.faces, uv), paint)
+        save_textured(place / "a.obj", TexturedMesh(shape.verts, shape.faces, uv), paint)
         save_shape(place / "b.ply", shape)
         save_map(place / "m.npz", VertexMap.identity(shape))
         for name in ("o.obj", "o.mtl", "o.png"):

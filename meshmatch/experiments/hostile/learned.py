@@ -32,8 +32,8 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepared_folder import read_registered
 from meshmatch.templates.template import load_template
-from meshmatch.training.alone import CHECKPOINT
 from meshmatch.training.datasets import registered_source
+from meshmatch.training.folder_lock import CHECKPOINT
 from meshmatch.training.loop import TrainConfig, Trainer
 from meshmatch.training.recipes import Recipe
 from meshmatch.training.scans import ScanConfig

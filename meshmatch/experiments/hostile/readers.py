@@ -20,7 +20,7 @@ from meshmatch.errors import MeshmatchError, visible
 from meshmatch.experiments.hostile.learned import trainers
 from meshmatch.generators.pose_files import load_poses
 from meshmatch.implicit.model import load_implicit
-from meshmatch.implicit.samples import samples_of
+from meshmatch.implicit.samples import sample_shape
 from meshmatch.maps.files import load_map
 from meshmatch.maps.fit_files import read_fit
 from meshmatch.models.card import IMPLICIT, read_card, read_implicit_card
@@ -34,7 +34,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import find_appearance, load_coordinates
 from meshmatch.shapes.vertex_lists import load_pairs, load_points
 from meshmatch.templates.prepared_folder import (
-    frame_of,
+    card_frame,
     has_sides,
     is_registered,
     read_landmarks,
@@ -68,10 +68,10 @@ def readers(family: str, path: Path, shape: Shape) -> Iterator[Callable[[], obje
         "known points": (lambda: read_landmarks(path, repair(shape)),),
         "names": (lambda: read_group(path, _EGGS) if path.stem == "group" else load_names(path),),
         "poses": (lambda: load_poses(path),),
-        "samples": (lambda: samples_of(path, 64, np.random.default_rng(0)),),
+        "samples": (lambda: sample_shape(path, 64, np.random.default_rng(0)),),
         "fits": (lambda: Collection(path.parents[1], 1).atlas(poor=True), lambda: _map_all(path)),
         "atlases": (lambda: _use_atlas(path),),
-        "prepared": tuple(partial(read, path.parent) for read in (_draw_shapes, is_registered, frame_of, has_sides)),
+        "prepared": tuple(partial(read, path.parent) for read in (_draw_shapes, is_registered, card_frame, has_sides)),
         "checkpoints": (lambda: trainers()[path.stem == "chair"].load(path),),
         "models": (lambda: verify_model(path.parent),),
         "implicit models": (lambda: verify_model(path.parent), lambda: load_implicit(path.parent)),

@@ -26,7 +26,7 @@ from meshmatch.models.checkpoint import save_weights as save_network
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.label_files import Labels, save_labels
@@ -84,7 +84,7 @@ def make_samples(folder: Path) -> list[Sample]:  # noqa: C901
     paint = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
     uv = np.random.default_rng(1).random((shape.F, 3, 2))
     for suffix in (".obj", ".glb"):
-        add("shapes", f"a{suffix}", lambda path: save_textured(path, Textured(shape.verts, shape.faces, uv), paint))
+        add("shapes", f"a{suffix}", lambda path: save_textured(path, TexturedMesh(shape.verts, shape.faces, uv), paint))
     index = np.arange(shape.V)[::-1].copy()
     trust = np.linspace(0, 1, shape.V)
     metadata: dict[str, Any] = {"confidence": trust, "verdict": "fair", "reasons": ("it lies far",)}

@@ -18,7 +18,7 @@ from meshmatch.experiments.makers.other_triangles import other_triangles
 from meshmatch.generators.bodies import draw_identities, template_rig
 from meshmatch.generators.characters import CharacterConfig, sample_layers
 from meshmatch.generators.figure import Figure
-from meshmatch.generators.proportions import CHILD, SHARES, draw_style, stretched
+from meshmatch.generators.proportions import CHILD, SHARES, draw_style, scale_bones
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
@@ -39,7 +39,7 @@ class Character:
     places: Int[Ints, " V"]
 
 
-def people(template: Template, count: int, kind: int, seed: int = 0, tag: str = "") -> list[Character]:
+def clothed_people(template: Template, count: int, kind: int, seed: int = 0, tag: str = "") -> list[Character]:
     """Clothed people with one of the styles of `meshmatch.generators.proportions`.
 
     They are drawn from 64 identities that no training of a bundled model used.
@@ -59,7 +59,9 @@ def people(template: Template, count: int, kind: int, seed: int = 0, tag: str = 
     return characters
 
 
-def touching(template: Template, count: int, seed: int = 0, tag: str = "", fused: bool = False) -> list[Character]:
+def people_in_contact(
+    template: Template, count: int, seed: int = 0, tag: str = "", fused: bool = False
+) -> list[Character]:
     """Naked people, every second one a child, in the poses of `contact_poses.POSES` in order.
 
     They are drawn from 64 identities that no training used. With ``fused``, shapes are the outer surfaces of the bodies, in
@@ -70,7 +72,7 @@ def touching(template: Template, count: int, seed: int = 0, tag: str = "", fused
     rest, heads = draw_identities(figure.rig, count, generator)
     children = torch.arange(1, count, 2)
     style = draw_style(len(children), generator, [float(kind == CHILD) for kind in range(len(SHARES))])
-    rest[children], heads[children] = stretched(figure, rest[children], heads[children], style)
+    rest[children], heads[children] = scale_bones(figure, rest[children], heads[children], style)
     names = [list(POSES)[k % len(POSES)] for k in range(count)]
     posed = contact_poses(figure, rest, heads, names, seed).double().numpy()
     weights, fine = other_triangles(figure.rig.faces.numpy(), posed.shape[1])

@@ -25,7 +25,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
-from meshmatch.templates.sides import mirrored
+from meshmatch.templates.mirror_images import mirrored
 from meshmatch.templates.template import Template
 
 STUMPS = {"hand": "wrist", "head": "neck"}

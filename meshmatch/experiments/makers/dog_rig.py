@@ -23,8 +23,8 @@ from meshmatch.experiments.makers.mujoco_skin import find_files, read_animal
 from meshmatch.generators.quadruped_rig import AnimalRig, mean_of_neighbours, save_rig, smooth_step
 from meshmatch.generators.quadrupeds import resting_animal
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.normalise import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import Template, read_template

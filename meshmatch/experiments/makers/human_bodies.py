@@ -13,7 +13,7 @@ from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, skin
 from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.geometry.trees import cKDTree
-from meshmatch.shapes.normalise import sqrt_area_frame
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig, choose_nodes, make_template
 from meshmatch.templates.template import Template

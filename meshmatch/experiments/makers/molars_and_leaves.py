@@ -35,7 +35,7 @@ def sphere(count: int) -> tuple[Float[Floats, "V 3"], Int[Ints, "F 3"]]:
     return directions, outward(directions, ConvexHull(directions).simplices.astype(np.int64))
 
 
-def varied(
+def deform_randomly(
     verts: Float[Floats, "V 3"], much: float, wide: float, rng: np.random.Generator, places: int = 12
 ) -> Float[Floats, "V 3"]:
     """Smooth random deformation: Gaussians of width ``wide`` at random places, with amplitudes of deviation ``much``."""
@@ -63,7 +63,7 @@ def molars(count: int, seed: int = 0, vertices: int = 4000) -> Registered:
         for place, push in roots:
             verts = verts + rng.uniform(0.8, 1.2) * bump_at(d, place, 14.0) * np.array(push)
         size = 1 + 0.07 * rng.standard_normal() + 0.05 * rng.standard_normal(3)
-        shapes.append(varied(verts * size, 0.35, 3.0, rng))
+        shapes.append(deform_randomly(verts * size, 0.35, 3.0, rng))
     return Registered(np.array(shapes), faces)
 
 
@@ -84,7 +84,7 @@ def leaves(count: int, seed: int = 0, vertices: int = 3000) -> Registered:
         fold, bend, twist = rng.uniform(0.2, 0.45), rng.uniform(-0.004, 0.006), rng.normal(0, 0.006)
         z = fold * np.sqrt(x**2 + 4.0) + bend * y**2 + twist * x * y
         verts = np.stack([x, y, z], axis=1) * (1 + 0.1 * rng.standard_normal())
-        shapes.append(varied(verts, 1.5, 20.0, rng))
+        shapes.append(deform_randomly(verts, 1.5, 20.0, rng))
     return Registered(np.array(shapes), faces)
 
 
@@ -106,7 +106,9 @@ def knees(count: int, seed: int = 0, vertices: int = 2400) -> Registered:
         lower = (lower + np.array([2.0, 0.0, gap]) - joint) @ bend.T + joint
         patella = small * [11.0, 5.0, 13.0] * rng.uniform(0.85, 1.15, 3) - 2.5 * bump_at(small, (0.5, -0.8, 0.2), 6.0)
         patella += joint + np.array([1.5, upper[:, 1].max() + 9.0, 24.0 + rng.normal(0, 2)])
-        shapes.append(np.concatenate([varied(upper, 0.8, 15.0, rng), varied(lower, 0.8, 15.0, rng), patella]))
+        shapes.append(
+            np.concatenate([deform_randomly(upper, 0.8, 15.0, rng), deform_randomly(lower, 0.8, 15.0, rng), patella])
+        )
     return Registered(np.array(shapes), faces)
 
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from meshmatch.api.inputs import as_model, validated
+from meshmatch.api.inputs import as_model, repair_or_raise
 from meshmatch.arrays import Float, Floats
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import BenchSet
 from meshmatch.experiments.paper.ablation_views import Run
-from meshmatch.experiments.runner import spread
+from meshmatch.experiments.runner import evenly_spread
 from meshmatch.fitting.fit_config import FitConfig, LatentRefineConfig
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.search.latent import refine_code
@@ -83,21 +83,21 @@ class Subject:
 def find_core_frame(shape: Shape, model: str, measure: Measure) -> Frame:
     """Find the core frame of a shape by fitting a model."""
     config = FitConfig(seed=measure.seed, partial="no")
-    return Fitter(as_model(model), config).fit(validated(shape).shape).frame
+    return Fitter(as_model(model), config).fit(repair_or_raise(shape).shape).frame
 
 
 def chosen_names(bench: BenchSet, measure: Measure) -> list[str]:
     """Names of the evaluated shapes: evenly spread over those that are the target of some pair."""
     targets = {target for _, target in bench.pairs}
-    return spread([name for name in bench.shapes if name in targets], measure.shapes)
+    return evenly_spread([name for name in bench.shapes if name in targets], measure.shapes)
 
 
 def build_subject(bench: BenchSet, name: str, frame: Frame, measure: Measure, cache: Path | None) -> Subject:
     """Sample a shape with a known core frame, and compute the distances from its landmarks."""
     shape, landmarks = bench.seen(name), bench.landmarks(name)
-    chosen = np.array(spread(range(len(landmarks)), measure.landmarks))
+    chosen = np.array(evenly_spread(range(len(landmarks)), measure.landmarks))
     distances = TruthDistances(bench.shape(name), landmarks[chosen], cache).of(np.arange(len(chosen)))
-    samples = sample_surface(validated(shape).shape, measure.samples, np.random.default_rng(measure.seed))
+    samples = sample_surface(repair_or_raise(shape).shape, measure.samples, np.random.default_rng(measure.seed))
     return Subject(
         name, frame, samples.in_frame(frame), shape.verts[landmarks[chosen]], cKDTree(shape.verts), distances
     )

@@ -31,7 +31,7 @@ from meshmatch.models.layers import BasisEncoder
 from meshmatch.models.network import NetworkConfig
 from meshmatch.models.registry import CARD
 from meshmatch.outputs import make_folder
-from meshmatch.templates.make import NodeConfig, Strategy, lay_nodes
+from meshmatch.templates.make import NodeConfig, Strategy, place_nodes
 from meshmatch.templates.template import Template, read_template, template_radius
 from meshmatch.threads import set_threads
 from meshmatch.training.datasets import Batch
@@ -148,7 +148,7 @@ def _resting(pose: str) -> Template:
 def _place_nodes(template: Template, K: int, radius: float, strategy: Strategy) -> tuple[Template, Strategy]:
     for rule in dict.fromkeys((strategy, "uniform")):
         try:
-            chosen = lay_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
+            chosen = place_nodes(template.shape, NodeConfig(rule, K, radius, grow=True), template.labels)
             return replace(template, nodes=chosen.nodes, radius=chosen.radius), rule
         except TemplateError:
             if rule == "uniform":

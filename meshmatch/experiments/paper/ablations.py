@@ -68,7 +68,7 @@ class Study:
 
     def metadata(self) -> dict[str, Any]:
         """Metadata of a measurement."""
-        return runner.circumstances(self.setting.threads)
+        return runner.run_metadata(self.setting.threads)
 
     @cached_property
     def reference(self) -> str:
@@ -83,7 +83,7 @@ class Study:
         if name in self.earlier and not path.is_file():
             result: dict[str, Any] | None = runner.check_cached(self.earlier[name], asked, f"{name} of --rows")
         else:
-            result = runner.read_cached(path, asked) if self.show else runner.once(path, asked, measure)
+            result = runner.read_cached(path, asked) if self.show else runner.cached(path, asked, measure)
         if result is not None:
             self.rows[name] = result
         return result
@@ -93,7 +93,7 @@ class Study:
         steps = run.steps or self.steps
 
         def measure() -> dict[str, Any]:
-            runner.tell(f"training {run.name}: {steps} steps")
+            runner.log(f"training {run.name}: {steps} steps")
             try:
                 summary = train_run(run, self.setting, self.folder / run.name / "model", steps)
             except TemplateError as error:
@@ -120,7 +120,7 @@ class Study:
                     if not (folder / "model").is_dir():
                         hint = "train it again: remove that folder, and its rows from the file of --rows"
                         raise OptionError(f"{folder} lacks its model", hint)
-                    runner.tell(f"measuring {run.name} on {bench.name}: {method}")
+                    runner.log(f"measuring {run.name} on {bench.name}: {method}")
                     model, subjects = as_model(folder / "model"), self.subjects(bench)
                     return {**self.metadata(), **errors_of(model, run, subjects, self.model, method, self.measure)}
 
@@ -141,7 +141,7 @@ class Study:
         names = chosen_names(bench, self.measure)
 
         def measure() -> dict[str, Any]:
-            runner.tell(f"orienting {len(names)} shapes of {bench.name}")
+            runner.log(f"orienting {len(names)} shapes of {bench.name}")
             return {
                 "frames": {name: asdict(find_core_frame(bench.seen(name), self.model, self.measure)) for name in names}
             }
@@ -163,7 +163,7 @@ class Study:
         runs = VIEWS["table4"].runs
 
         def measure() -> dict[str, Any]:
-            runner.tell(f"timing {len(runs)} runs side by side")
+            runner.log(f"timing {len(runs)} runs side by side")
             return {**self.metadata(), "times": time_iterations(self.setting, runs, rounds)}
 
         asked = {"runs": [asdict(run) for run in runs], "setting": asdict(self.setting), "rounds": rounds}
@@ -237,11 +237,11 @@ def main(
     rows: Annotated[Path | None, Option(help="file from --save, whose results are not measured again")] = None,
     show: Annotated[bool, Option("--show", help="measure nothing, show existing results")] = False,
 ) -> runner.Report:
-    names = [name for name in VIEWS if name in runner.names_of(views, VIEWS, "view")]
-    runs = all_runs(names, seeds, runner.names_of(repeated, VIEWS, "view"))
-    benches = [load_set(name, data) for name in runner.names_of(sets, ALL_SETS, "set")]
+    names = [name for name in VIEWS if name in runner.split_names(views, VIEWS, "view")]
+    runs = all_runs(names, seeds, runner.split_names(repeated, VIEWS, "view"))
+    benches = [load_set(name, data) for name in runner.split_names(sets, ALL_SETS, "set")]
     setting, measure = Setting(threads, batch, loss), Measure(shapes=shapes, code_steps=code_steps)
-    method_names = runner.names_of(methods, METHODS, "method")
+    method_names = runner.split_names(methods, METHODS, "method")
     earlier = saved_rows(rows) if rows else {}
     study = Study(output, setting, measure, steps, model, benches, cache, show, method_names, earlier)
     measured = study.measure_all(runs, names, rounds)

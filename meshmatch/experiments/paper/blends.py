@@ -74,11 +74,11 @@ def main(
                 run = replace(BASE, constraint=constraint, seed=seed)
 
                 def measure(run: Run = run) -> dict[str, Any]:
-                    runner.tell(f"training {run.name}: {steps} steps")
+                    runner.log(f"training {run.name}: {steps} steps")
                     trained = train_run(run, setting, folder / run.name / "model", steps)
                     return {**trained, **energies(as_model(folder / run.name / "model"), run, setting)}
 
                 asked = {"run": asdict(run), "setting": asdict(setting), "steps": steps}
-                results[label].append(runner.once(folder / run.name / "measured.json", asked, measure))
+                results[label].append(runner.cached(folder / run.name / "measured.json", asked, measure))
             rows.append(row_of(label, results[label]))
     return runner.Report({"rows": results}, [runner.table("Energies of blended codes", rows, _COLUMNS)])

@@ -81,7 +81,7 @@ def main(
         methods: dict[str, Method] = {"without a model": DirectMethod(seed), "ZoomOut": ZoomOut()}
         methods |= {"3D-CODED": coded(str(model), code_steps, seed)}
         for name, method in methods.items():
-            runner.tell(name)
+            runner.log(name)
             fits = {each: method.fit(shape) for each, shape in shapes.items()}
             maps = {
                 (each, SOURCE): method.map(shapes[each], fits[each], shapes[SOURCE], fits[SOURCE]) for each in TARGETS

@@ -70,7 +70,7 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         work_folder = work or Path(temporary)
         folder, asked = work_folder / "model", {"narrow": narrow, "steps": steps, "bodies": bodies, "seed": seed}
-        summary = runner.at_work(
+        summary = runner.cached_in(
             work_folder, "trained", asked, lambda: trained(folder, template, narrow, steps, bodies, seed)
         )
         trained_model = load_model(folder, encoder=encoder_of(CHANGE, 1024 // narrow))
@@ -81,7 +81,7 @@ def main(
                 for each in chosen_names(bench, measure)
             ]
             for how, refined in METHODS.items():
-                runner.tell(f"{name}: {refined}")
+                runner.log(f"{name}: {refined}")
                 rows.append(
                     {"set": name, "refined": refined, **errors_of(trained_model, run, subjects, model, how, measure)}
                 )

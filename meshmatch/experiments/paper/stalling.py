@@ -190,7 +190,7 @@ def train_network(
         if every and (step + 1) % every == 0:
             curve[step + 1] = _distance(*predict_held_out(model, points, scans, change))
             model.train()
-            runner.tell(f"step {step + 1}: {curve[step + 1]:.2f} cm held out")
+            runner.log(f"step {step + 1}: {curve[step + 1]:.2f} cm held out")
     return TrainedNetwork(trainer, points, replace(recipe, train=config), last_errors, curve, seconds)
 
 
@@ -225,10 +225,10 @@ def main(
     template, rows = read_template("human-T-300"), []
     scans = scans_of(template, bodies)
     for name, change in CHANGES.items():
-        runner.tell(f"{name}: {steps} steps")
+        runner.log(f"{name}: {steps} steps")
         measure_change = partial(measure, change, template, scans, narrow, steps, seed)
         asked = {"change": vars(change), "narrow": narrow, "steps": steps, "bodies": bodies, "seed": seed}
-        rows.append({"changed": name, **runner.at_work(work, name.replace(" ", "-"), asked, measure_change)})
+        rows.append({"changed": name, **runner.cached_in(work, name.replace(" ", "-"), asked, measure_change)})
     means = {change.yaw: row["mean_body"] for row, change in zip(rows, CHANGES.values(), strict=True)}
     notes = [f"Mean body: {means[True]:.2f} cm, {means[False]:.2f} without turns"]
     title = f"The paper's network, {narrow} times narrower, after {steps} steps; errors in cm"

@@ -25,16 +25,16 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map
 
-KNOWN = 0.0485
+MAX_KNOWN_RESIDUAL = 0.0485
 """Largest residual (units of sqrt(area)) of a shape that the model knows. The benchmark's bodies, scans and animals have
 0.046 at most, its hearts and furniture 0.051 at least (docs/results.md)."""
-FAMILIAR, STRANGE = 0.0465, 0.062
+MAX_CERTAIN_RESIDUAL, MIN_FOREIGN_RESIDUAL = 0.0465, 0.062
 """Residuals between these limits are inconclusive, for robots as for aeroplanes with wings like arms: a full fit decides,
 see `is_of_category`."""
-SURE = 0.042
+MAX_UNRIVALLED_RESIDUAL = 0.042
 """Residuals up to this need no comparison with other models: those of other categories were 0.0439 at least
 (docs/results.md)."""
-BELONGS = 0.7
+MIN_CATEGORY_TRUST = 0.7
 """Least trust of a full fit that puts a shape into the category. For a mesh and a template with limbs, any fit that is
 not poor does: limbless templates fit many shapes (the head model can fit a heart fairly), and people fit clouds of
 aeroplanes fairly."""
@@ -63,7 +63,7 @@ def category_residual(model: TrainedModel, shape: Shape, samples: OrientedPoints
     return predictor.fit(placed, best.pose, draws=1).residual
 
 
-class Readings:
+class CategoryResiduals:
     """`category_residual` of several repaired shapes under several models, which are loaded when needed.
 
     ``found`` (M, S) is infinite where a model is damaged or cannot process a shape, and where it has not been asked.
@@ -116,7 +116,7 @@ class Judged(Protocol):
 
 def needs_a_fit(residual: float) -> bool:
     """Whether a residual alone does not decide if a shape is of a category."""
-    return FAMILIAR < residual <= STRANGE
+    return MAX_CERTAIN_RESIDUAL < residual <= MIN_FOREIGN_RESIDUAL
 
 
 def is_of_category(model: TrainedModel, shape: Shape, residual: float, fit: Judged | None) -> bool:
@@ -125,8 +125,8 @@ def is_of_category(model: TrainedModel, shape: Shape, residual: float, fit: Judg
     A fit as a part adds nothing to the residual.
     """
     if fit is None:
-        return residual <= FAMILIAR
+        return residual <= MAX_CERTAIN_RESIDUAL
     if fit.partial:
-        return residual <= KNOWN
+        return residual <= MAX_KNOWN_RESIDUAL
     clear = has_limbs(model) and not shape.is_cloud
-    return fit.verdict != "poor" and (fit.trust >= BELONGS or clear)
+    return fit.verdict != "poor" and (fit.trust >= MIN_CATEGORY_TRUST or clear)

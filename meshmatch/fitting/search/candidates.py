@@ -37,7 +37,7 @@ from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import vertex_areas
 from meshmatch.progress import Progress
-from meshmatch.shapes.normalise import ALIGNS
+from meshmatch.shapes.alignment import ALIGNS
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.threads import parallel_map

@@ -15,10 +15,10 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.derived import derived
 from meshmatch.fitting.fit_config import FitConfig, axis_of
 from meshmatch.geometry.frames import Frame, RigidPose
-from meshmatch.geometry.oriented import OrientedPoints, nearest
+from meshmatch.geometry.oriented import OrientedPoints, nearest_by_brute_force
 from meshmatch.models.network import Network
 from meshmatch.models.trained import TrainedModel
-from meshmatch.shapes.normalise import ALIGNS, align
+from meshmatch.shapes.alignment import ALIGNS, align
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import SCALES, template_radius, template_samples, unit_frame
 
@@ -182,7 +182,7 @@ def ask_aligner(
     cloud = (points - middle).astype(np.float32)
     # Turning the basis the other way is cheaper than turning and indexing the points N times.
     queries = np.einsum("mk,nkl->nml", network.align_basis, turns).astype(np.float32)
-    offsets = cloud[nearest(cloud, queries.reshape(-1, 3))].reshape(queries.shape) - queries  # N M 3
+    offsets = cloud[nearest_by_brute_force(cloud, queries.reshape(-1, 3))].reshape(queries.shape) - queries  # N M 3
     R, t = network.read_frames(offsets @ turns.astype(np.float32).transpose(0, 2, 1))
     back = turns.transpose(0, 2, 1)
     return back @ R, (back @ t[..., None])[..., 0] + middle

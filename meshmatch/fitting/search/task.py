@@ -17,9 +17,9 @@ from meshmatch.geometry.frames import Frame
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.trained import TrainedModel
 from meshmatch.progress import Progress
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.cloud import outlier_points
-from meshmatch.shapes.normalise import sqrt_area_frame
-from meshmatch.shapes.outside import without_hidden
+from meshmatch.shapes.hidden_faces import remove_hidden_faces
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -142,7 +142,7 @@ def without_outliers(shape: Shape) -> Shape:
 
 def without_interior(shape: Shape, system: NodeSystem) -> Shape:
     """A mesh without faces that are hidden from outside, unless the template has hidden surface itself."""
-    return without_hidden(shape) if system.shows_all else shape
+    return remove_hidden_faces(shape) if system.shows_all else shape
 
 
 def take_samples(

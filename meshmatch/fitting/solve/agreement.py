@@ -28,7 +28,7 @@ from meshmatch.fitting.solve.priors import Prior, RotatedReference
 from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.fitting.solve.terms import Landmarks, terms_of
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.geometry.symmetric import entries_of, exponential, logarithm, matrices_of
+from meshmatch.geometry.symmetric import exponential, logarithm, to_entries, to_matrices
 from meshmatch.models.pair_statistics import PairStatistics
 from meshmatch.models.trained import TrainedModel
 
@@ -170,7 +170,7 @@ class CommonStretch:
         self._follow = [likeness(log, logs, config.alike) for log, config in zip(logs, configs, strict=True)]
 
     def __call__(self, gradients: Sequence[Float[Floats, "G 3 3"]]) -> list[Prior]:
-        mean = held_mean(self._first, mean_log([log_stretch(F) for F in gradients]), self._config)
+        mean = damped_mean(self._first, mean_log([log_stretch(F) for F in gradients]), self._config)
         return [
             RotatedReference(stretch_of(mean + own if share > _SAME else log + share * (mean + own - log)))
             for log, share, own in zip(self._logs, self._follow, self._own, strict=True)
@@ -198,7 +198,7 @@ def agree_step(
     return member.problem(system).step(0, vectors, F, RotatedReference(common))
 
 
-def held_mean(
+def damped_mean(
     first: Float[Floats, "G 3 3"], now: Float[Floats, "G 3 3"], config: AgreeConfig
 ) -> Float[Floats, "G 3 3"]:
     """Logarithm of the common stretch: between the mean of the fits before agreement and their current mean.
@@ -219,9 +219,9 @@ def mean_log(logs: Sequence[Float[Floats, "G 3 3"]]) -> Float[Floats, "G 3 3"]:
 
 def log_stretch(F: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
     """Logarithm of the right stretch sqrt(F^T F)."""
-    return matrices_of(0.5 * logarithm(entries_of(F.transpose(0, 2, 1) @ F), _MIN_STRETCH**2))
+    return to_matrices(0.5 * logarithm(to_entries(F.transpose(0, 2, 1) @ F), _MIN_STRETCH**2))
 
 
 def stretch_of(logs: Float[Floats, "G 3 3"]) -> Float[Floats, "G 3 3"]:
     """The stretch with the given logarithm."""
-    return matrices_of(exponential(entries_of(logs)))
+    return to_matrices(exponential(to_entries(logs)))

@@ -26,8 +26,8 @@ from meshmatch.geometry.frames import kabsch
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.geometry.triangles import row_sums, triangle_vectors
 from meshmatch.models.trained import TrainedModel
-from meshmatch.shapes.outside import without_hidden
-from meshmatch.shapes.rims import RIM, is_sheet, rim_corners, rim_lengths
+from meshmatch.shapes.hidden_faces import remove_hidden_faces
+from meshmatch.shapes.rims import MIN_RIM_LENGTH, is_sheet, rim_corners, rim_lengths
 from meshmatch.shapes.sampling import farthest_points
 from meshmatch.shapes.shape import Shape
 
@@ -76,7 +76,7 @@ class NodeSystem:
     @derived
     def rim(self) -> Bool[Bools, " V"]:
         """Mask (V,) of vertices where the template ends; cracks are not ends."""
-        return rim_lengths(Shape(self.verts, self.faces)) > RIM
+        return rim_lengths(Shape(self.verts, self.faces)) > MIN_RIM_LENGTH
 
     @property
     @derived
@@ -101,7 +101,7 @@ class NodeSystem:
     def shows_all(self) -> bool:
         """Whether all of the rest template is visible from outside; the chambers of a heart are not."""
         resting = Shape(self.verts, self.faces)
-        return without_hidden(resting) is resting
+        return remove_hidden_faces(resting) is resting
 
     def moved(self, vectors: Float[Floats, "K 3"]) -> Float[Floats, "V 3"]:
         """Template vertices under node vectors (or the output rows of a field without nodes)."""

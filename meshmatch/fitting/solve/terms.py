@@ -20,7 +20,7 @@ from meshmatch.fitting.solve.system import NodeSystem
 from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_normals
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import row_sums, vertex_areas
-from meshmatch.shapes.rims import RimPoints, at_rim
+from meshmatch.shapes.rims import RimPoints, rim_edges
 
 _MIN_OUTWARD_COSINE = 0.2  # between the outward directions of two paired points on rims
 _MAX_SHARERS = 16  # maximum number of template vertices that share a point
@@ -109,7 +109,7 @@ class RimTerm:
 
     def quadratic(self, system: NodeSystem, vectors: Float[Floats, "K 3"], scale: float) -> Quadratic:
         moved, rim, corners = system.moved(vectors), self.rim, system.rim_corners
-        length, out, _ = at_rim(moved, corners)
+        length, out, _ = rim_edges(moved, corners)
         vertex, at = np.unique(corners[:, :2].T.ravel(), return_inverse=True)
         lengths = np.bincount(at, np.tile(length / 2, 2))
         outward = _sums(at, np.tile(out * length[:, None], (2, 1)).T, len(vertex))
@@ -147,7 +147,7 @@ def _nearest_pairs(
     """Pairs with the nearest point of similar normal, in both directions, with half of the weight each."""
     moved, normals = surface.points, surface.normals
     features = with_normals(moved, normals, config.pair_normals)
-    to_samples = samples.pair_tree(config.pair_normals).query(features)[1]
+    to_samples = samples.weighted_tree(config.pair_normals).query(features)[1]
     partner, partner_normal = samples.points.take(to_samples, 0), samples.normals.take(to_samples, 0)
     area = vertex_areas(moved, system.faces)
     forward = area / area.sum() * robust_weight(moved - partner, scale)

@@ -15,7 +15,7 @@ from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import same_rows
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.render.viewer.assembly import scaled, small_integers
-from meshmatch.render.viewer.drawn import Drawn
+from meshmatch.render.viewer.drawn_shapes import Drawn
 from meshmatch.shapes.appearance import Appearance, Material, Pixels, png_bytes
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.shape import Shape

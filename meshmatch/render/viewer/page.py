@@ -14,7 +14,7 @@ from meshmatch.render.compose import matched_colors
 from meshmatch.render.facing import Rotations
 from meshmatch.render.scales import Scale, position_colors
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
-from meshmatch.render.viewer.drawn import MOST, Box, Drawn, boxes, draw, view_rotations
+from meshmatch.render.viewer.drawn_shapes import MAX_VERTICES, Box, Drawn, boxes, draw, view_rotations
 from meshmatch.render.viewer.looks import Looks, look_arrays
 from meshmatch.shapes.shape import Shape
 
@@ -53,7 +53,7 @@ def write_page(
     check_page(path)
     there, back = there.for_shapes(source, target), back.for_shapes(target, source, "the map back")
     shapes, maps = (source, target), (there, back)
-    parts = draw(source, MOST), draw(target, MOST)
+    parts = draw(source, MAX_VERTICES), draw(target, MAX_VERTICES)
     turns = view_rotations(source, target, there, rotations)
     cubes = boxes(shapes, parts, there, turns)
     position = position_colors(source, turns[0])

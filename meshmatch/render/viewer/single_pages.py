@@ -15,8 +15,8 @@ from meshmatch.arrays import Float, Floats
 from meshmatch.errors import OptionError
 from meshmatch.render.scales import CLAY, Scale
 from meshmatch.render.viewer.assembly import check_page, plain_text, scaled, small_integers, write_html
-from meshmatch.render.viewer.drawn import MOST, draw, span
-from meshmatch.shapes.faces import seams
+from meshmatch.render.viewer.drawn_shapes import MAX_VERTICES, draw, span
+from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 
 MAX_MODES = 12
@@ -34,7 +34,7 @@ def write_motion(
     rotation: Float[Floats, "3 3"],
     met: Mapping[float, str] | None = None,
     title: str = "",
-    most: int = MOST,
+    most: int = MAX_VERTICES,
 ) -> int:
     """Write a page on which a shape moves through frames; return its size in bytes. The same input gives the same bytes.
 
@@ -57,7 +57,7 @@ def write_motion(
     low, edge, cube = span(np.concatenate([verts[part.used] for verts in turned]))
     normals = [np.zeros_like(verts) for verts in turned]  # of points, which face the viewer then
     if len(faces):  # equal on both sides of a seam
-        welded = seams(turned[0], faces)
+        welded = seam_representatives(turned[0], faces)
         normals = [Shape(verts, welded[faces]).vertex_normals[welded] for verts in turned]
     colors = np.tile(CLAY, (first.V, 1)) if first.colors is None else first.colors[:, :3]
     arrays: dict[str, NDArray[Any]] = {
@@ -93,7 +93,7 @@ class Varying:
 
 
 def write_atlas_page(
-    path: str | Path, atlas: Varying, *, rotation: Float[Floats, "3 3"], title: str = "", most: int = MOST
+    path: str | Path, atlas: Varying, *, rotation: Float[Floats, "3 3"], title: str = "", most: int = MAX_VERTICES
 ) -> int:
     """Write a page on which sliders vary a shape, colored by its distance from the mean; return its size in bytes.
 

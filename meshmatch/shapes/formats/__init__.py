@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, OutputError, warn
-from meshmatch.shapes.colors import light, seen
+from meshmatch.shapes.colors import linear_to_srgb_alpha, srgb_to_linear_alpha
 
 NO_FACES = np.empty((0, 3), np.int64)
 NO_MESH = "is it a mesh or a point cloud at all?"
@@ -57,7 +57,7 @@ class Raw:
 
 
 @dataclass(frozen=True, eq=False)
-class Textured:
+class TexturedMesh:
     """A mesh textured with one image, ready to be written, in the unit of the file.
 
     `uv` has texture coordinates per face corner (u to the right, v down); `cutoff` is the alpha threshold of "mask".
@@ -92,7 +92,7 @@ def check_element_count(name: str, size: int, vertices: int, faces: int = 0, tex
         raise InputError(message, "decimate it, or export it as a binary .ply or .glb with fewer copies of its meshes")
 
 
-def runs(starts: Int[Ints, " N"], sizes: Int[Ints, " N"], step: int = 1) -> Int[Ints, " M"]:
+def concatenated_ranges(starts: Int[Ints, " N"], sizes: Int[Ints, " N"], step: int = 1) -> Int[Ints, " M"]:
     """Concatenate the runs start, start + step, ..., where run i has sizes[i] elements."""
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     return np.asarray(np.repeat(starts, sizes) + step * within)
@@ -107,15 +107,15 @@ def fan(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
     if len(sizes) and (sizes == 3).all():
         return corners.reshape(-1, 3)
     starts, triangles = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
-    second = runs(starts + 1, triangles)
+    second = concatenated_ranges(starts + 1, triangles)
     return np.stack([corners[np.repeat(starts, triangles)], corners[second], corners[second + 1]], axis=1)
 
 
 def strips(corners: Int[Ints, " N"], sizes: Int[Ints, " P"]) -> Int[Ints, "F 3"]:
     """Split triangle strips, given as for `fan`: a b c d ... becomes a b c, c b d, ... (every other triangle flipped)."""
     counts = np.maximum(sizes - 2, 0)
-    first = runs(np.cumsum(sizes) - sizes, counts)
-    odd = runs(np.zeros(len(counts), np.int64), counts) % 2
+    first = concatenated_ranges(np.cumsum(sizes) - sizes, counts)
+    odd = concatenated_ranges(np.zeros(len(counts), np.int64), counts) % 2
     return np.stack([corners[first + odd], corners[first + 1 - odd], corners[first + 2]], axis=1)
 
 
@@ -126,7 +126,7 @@ def indices(name: str, values: NDArray[Any]) -> Ints:
     return values.astype(np.int64)
 
 
-def painted(channels: Float[Floats, "N C"]) -> Float[Floats, "N 4"]:
+def rgba_from_channels(channels: Float[Floats, "N C"]) -> Float[Floats, "N 4"]:
     """RGBA in 0..1 from 3 or 4 channels, missing alpha being 1.
 
     Values are taken to range to 255 if any is above 1, else to 1; this is decided separately for color and for alpha.
@@ -149,23 +149,25 @@ def as_float32(values: Floats, suffix: str) -> NDArray[np.float32]:
     return written
 
 
-def joined_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
+def concatenate_colors(colors: list[Float[Floats, "_ 4"] | None], counts: list[int]) -> Float[Floats, "V 4"] | None:
     """Concatenate the colors of several meshes, white for meshes without colors; None if no mesh has colors."""
     if all(color is None for color in colors):
         return None
     return np.vstack([np.ones((n, 4)) if c is None else c for c, n in zip(colors, counts, strict=True)])
 
 
-def colors_of_faces(count: int, corners: Int[Ints, " N"], colors: Float[Floats, "N 4"]) -> Float[Floats, "count 4"]:
+def vertex_colors_from_faces(
+    count: int, corners: Int[Ints, " N"], colors: Float[Floats, "N 4"]
+) -> Float[Floats, "count 4"]:
     """Convert face colors to vertex colors: the mean, in linear light, of the adjacent faces; white for unused vertices.
 
     `corners` are the vertices of all faces, one face after the other; `colors` has the color of its face for each corner.
     """
     in_range = (corners >= 0) & (corners < count)
-    corners, linear = corners[in_range], light(colors[in_range])
+    corners, linear = corners[in_range], srgb_to_linear_alpha(colors[in_range])
     n_corners = np.bincount(corners, minlength=count)[:, None]
     total = np.stack([np.bincount(corners, channel, count) for channel in linear.T], axis=1)
-    return np.where(n_corners > 0, seen(total / np.maximum(n_corners, 1)), 1.0)
+    return np.where(n_corners > 0, linear_to_srgb_alpha(total / np.maximum(n_corners, 1)), 1.0)
 
 
 def without_comments(text: bytes) -> bytes:

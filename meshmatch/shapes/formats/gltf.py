@@ -2,7 +2,7 @@
 
 Specification: Khronos glTF 2.0. A skinned mesh is posed by its joints as the file places them (sections 3.7.3 and 5.28),
 so that it fits other objects attached to the same joints. Animations and morph targets are ignored;
-`meshmatch.shapes.formats.gltf_attributes` reads materials and weights, `meshmatch.shapes.formats.gltf_out` writes files.
+`meshmatch.shapes.formats.gltf_attributes` reads materials and weights, `meshmatch.shapes.formats.gltf_write` writes files.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
-from meshmatch.shapes.companions import beside
+from meshmatch.shapes.companions import find_companion
 from meshmatch.shapes.formats import (
     NO_FACES,
     WRONG_SUFFIX,
     Raw,
     check_element_count,
+    concatenate_colors,
     damaged,
     fan,
-    joined_colors,
     strips,
 )
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS, DRACO, MESHOPT, WIDTHS, decompress
-from meshmatch.shapes.input_files import check_text, json_of, read_bytes
+from meshmatch.shapes.input_files import check_text_size, parse_json, read_bytes
 
 COMPRESSED = (DRACO, *MESHOPT)
 INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
@@ -58,7 +58,7 @@ T = TypeVar("T")
 
 def read(path: Path, data: bytes) -> Raw:
     """Read all triangles and points of the scene, one primitive after the other, parent nodes before their children."""
-    return understood(path, data, "scene makes", Document.scene)
+    return parse_document(path, data, "scene makes", Document.scene)
 
 
 def digest(faces: Int[Ints, "F 3"]) -> str:
@@ -66,7 +66,7 @@ def digest(faces: Int[Ints, "F 3"]) -> str:
     return hashlib.sha256(np.ascontiguousarray(faces, np.int64).data if len(faces) else b"").hexdigest()[:16]
 
 
-def understood(path: Path, data: bytes, what: str, reader: Callable[[Document], T]) -> T:
+def parse_document(path: Path, data: bytes, what: str, reader: Callable[[Document], T]) -> T:
     """Parse a file and return what `reader` extracts from it; a malformed JSON description raises `InputError`.
 
     `what` begins the error message, such as "scene makes". Checking values for NaN and inf is left to the caller.
@@ -105,8 +105,8 @@ class Document:
                 "does the suffix fit?",
             )
         try:
-            check_text(self.name, data)
-            self.json = json_of(self.name, data)
+            check_text_size(self.name, data)
+            self.json = parse_json(self.name, data)
         except ValueError as error:
             raise damaged(self.name, "its description is not JSON") from error
         if not isinstance(self.json, dict) or "asset" not in self.json:
@@ -175,7 +175,7 @@ class Document:
         self._warn_of_hidden()
         if not verts:
             raise InputError(f"{self.name} holds no triangles and no points", "is there a mesh in its scene?")
-        painted = joined_colors(colors, [len(positions) for positions in verts])
+        painted = concatenate_colors(colors, [len(positions) for positions in verts])
         if painted is not None:
             painted[:, :3] = to_srgb(painted[:, :3])
         is_skinned = np.concatenate(skinned)
@@ -249,11 +249,11 @@ class Document:
             message = f"the scene of {self.name} has over {MAX_NODES} nodes, or parts of meshes"
             raise InputError(message, "join its meshes before it is exported")
 
-    def draws_copies(self) -> bool:
+    def uses_instancing(self) -> bool:
         """Whether any node draws several instances of its mesh (`INSTANCES`)."""
         return any(INSTANCES in self.nodes[node].get("extensions", {}) for node, _, _ in self.primitives())
 
-    def beyond_triangles(self) -> list[str]:
+    def content_beyond_triangles(self) -> list[str]:
         """Kinds of content besides the triangles of one mesh with one material, in words ("normals", "skins", ...)."""
         parts = [part for mesh in self.json.get("meshes", []) for part in mesh["primitives"]]
         present = {
@@ -449,7 +449,7 @@ class Document:
                 return _decode_data_uri(uri)
             except (binascii.Error, ValueError) as error:
                 raise damaged(self.name, "its embedded data is not base64") from error
-        file = beside(self.path.parent, uri, uri=True)
+        file = find_companion(self.path.parent, uri, uri=True)
         if file is None:
             missing = f"{self.name} needs the file {uri[:200]}, which is not in its folder"
             raise InputError(missing, "copy it to the folder of the gltf")

@@ -2,7 +2,7 @@
 
 Specification: Khronos glTF 2.0, sections 3.7.3, 3.8 and 3.9; KHR_texture_transform,
 KHR_materials_pbrSpecularGlossiness (its diffuse part) and EXT_texture_webp. Metal, roughness, normals and light are read
-by `meshmatch.shapes.formats.gltf_finish`. Vertices and faces are those of `meshmatch.shapes.formats.gltf.read`, in the
+by `meshmatch.shapes.formats.gltf_layers`. Vertices and faces are those of `meshmatch.shapes.formats.gltf.read`, in the
 same order.
 """
 
@@ -17,10 +17,10 @@ from scipy.sparse import csr_array
 
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import InputError
-from meshmatch.outputs import numbered_apart, plain_text
+from meshmatch.outputs import make_unique, plain_text
 from meshmatch.shapes.appearance import Alpha, Appearance, ImageReader, Material, Pixels, Wrap, no_coordinates
-from meshmatch.shapes.formats import damaged, joined_colors
-from meshmatch.shapes.formats.gltf import Document, is_embedded, understood
+from meshmatch.shapes.formats import concatenate_colors, damaged
+from meshmatch.shapes.formats.gltf import Document, is_embedded, parse_document
 from meshmatch.shapes.shape import Shape
 
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -28,14 +28,14 @@ _ALPHAS: dict[str, Alpha] = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend
 _NEAREST = 9728
 
 
-def read_look(path: Path, data: bytes, _: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
+def read_appearance(path: Path, data: bytes, _: Shape, reader: ImageReader, picture: Pixels | None) -> Appearance:
     """Read materials, texture coordinates and vertex colors; `picture`, if given, replaces all images."""
-    return understood(path, data, "materials make", lambda document: Look(document, reader, picture).scene())
+    return parse_document(path, data, "materials make", lambda document: Look(document, reader, picture).scene())
 
 
 def read_coordinates(path: Path, data: bytes, _: Shape) -> Float[Floats, "F 3 2"] | None:
     """Read the first texture coordinates of all faces; None if any primitive with faces has none."""
-    return understood(path, data, "texture coordinates make", _coordinates)
+    return parse_document(path, data, "texture coordinates make", _coordinates)
 
 
 def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
@@ -44,7 +44,7 @@ def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
     The joints of all skins form one list, in the file's node order. An unskinned mesh below a joint, such as a sword in
     a hand, gets weight 1 for that joint. `InputError` if the file is damaged or has no skin.
     """
-    return understood(path, data, "skin makes", _skin)
+    return parse_document(path, data, "skin makes", _skin)
 
 
 def _coordinates(document: Document) -> Floats | None:
@@ -117,7 +117,7 @@ class Look:
                 self.materials[key] = self.read(*key)
             material_of_face.append(np.full(len(faces), numbers.setdefault(key, len(numbers))))
             uvs.append(np.zeros((len(faces), 3, 2)) if uv is None else uv[faces])
-        vertex_colors = joined_colors(colors, counts)
+        vertex_colors = concatenate_colors(colors, counts)
         found = Appearance(
             tuple(self.materials.values()), np.concatenate(material_of_face), np.concatenate(uvs), vertex_colors
         )
@@ -221,5 +221,5 @@ def _skin(document: Document) -> tuple[csr_array, tuple[str, ...]]:
         raise InputError(f"{document.name} has a skin that moves no vertex", "was it exported with its weights?")
     vertices, joints, weights = (np.concatenate(each) for each in zip(*entries, strict=True))
     labels = [document.nodes[node].get("name") or f"joint {node}" for node in nodes]
-    names = numbered_apart((plain_text(str(label)) for label in labels), " ")
+    names = make_unique((plain_text(str(label)) for label in labels), " ")
     return csr_array((weights, (vertices, joints)), (n_verts, len(nodes))), tuple(names)

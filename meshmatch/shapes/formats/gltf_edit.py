@@ -20,8 +20,8 @@ from meshmatch.errors import InputError
 from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import INSTANCES, MAX_ORIGINS, ORIGINS, Document, digest, is_embedded
 from meshmatch.shapes.formats.gltf_compressed import COMPONENTS
-from meshmatch.shapes.formats.gltf_out import INDICES, TYPES, VERTICES, pack_glb
 from meshmatch.shapes.formats.gltf_prune import prune, unused
+from meshmatch.shapes.formats.gltf_write import INDICES, TYPES, VERTICES, pack_glb
 from meshmatch.shapes.shape import Shape
 
 _COMPONENTS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
@@ -198,7 +198,7 @@ class Editor:
         return pack_glb(self.name, self.json, self._chunks)
 
 
-def remembering(glb: bytes, of: Shape) -> bytes:
+def record_source_mesh(glb: bytes, of: Shape) -> bytes:
     """Record in a glb the mesh it was made from; see `Shape.made_of`.
 
     The glb is returned unchanged unless its first vertices are those of the mesh, in order, followed only by copies of

@@ -15,11 +15,11 @@ import numpy as np
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import warn
 from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_add_skeleton import drop_channels
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_prune import drop_nodes
 from meshmatch.shapes.formats.gltf_rig import nodes_of_skeleton
-from meshmatch.shapes.formats.gltf_rigged import drop_channels
 from meshmatch.shapes.formats.gltf_vrm import CONSTRAINT, SPRINGS, VRM0, VRM1, nested, nested_entries
 
 _VRM1_NAMES = {  # names in VRM 1.0 of the bones that VRM 0.x calls differently
@@ -30,7 +30,7 @@ _VRM1_NAMES = {  # names in VRM 1.0 of the bones that VRM 0.x calls differently
 
 
 @dataclass(frozen=True)
-class Person:
+class HumanoidBones:
     """Correspondence between humanoid bones and skeleton nodes.
 
     Attributes
@@ -48,7 +48,7 @@ class Person:
     nodes: int
 
 
-def person_of(source: Document, target: Document) -> Person | None:
+def find_humanoid_bones(source: Document, target: Document) -> HumanoidBones | None:
     """Find the humanoid bones of a source: by its VRM extension, or else by the names of the target's bone nodes.
 
     None if it has no extension and not exactly one node for every bone name, or if hips or head are missing.
@@ -71,10 +71,10 @@ def person_of(source: Document, target: Document) -> Person | None:
         bones = {bone: index_of_name[name] for bone, name in name_of_bone.items()}
     if not {"hips", "head"} <= bones.keys():
         return None
-    return Person(bones, tuple(nodes_of_skeleton(target, joint_nodes(target))), len(target.nodes))
+    return HumanoidBones(bones, tuple(nodes_of_skeleton(target, joint_nodes(target))), len(target.nodes))
 
 
-def with_bones(document: Document, person: Person) -> bytes:
+def with_humanoid_bones(document: Document, person: HumanoidBones) -> bytes:
     """Return the rigged target as a character whose humanoid bones are nodes of its new skeleton.
 
     The former skeleton is removed together with its springs and constraints. Bones of VRM 0.x must have no rotation, so
@@ -172,7 +172,7 @@ def _remove_rotations(editor: Editor, document: Document, nodes: range) -> dict[
     return worlds
 
 
-def _drop_physics(editor: Editor, person: Person) -> None:
+def _drop_physics(editor: Editor, person: HumanoidBones) -> None:
     """Remove the springs and constraints of the former skeleton."""
     json, n_removed = editor.json, 0
     springs = nested(json, "extensions", VRM0, "secondaryAnimation")

@@ -13,18 +13,18 @@ import numpy as np
 from meshmatch.arrays import Floats
 from meshmatch.shapes.formats import gltf_vrm
 from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_add_skeleton import bake_transform, rigid_frame
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes
-from meshmatch.shapes.formats.gltf_out import VERTICES
 from meshmatch.shapes.formats.gltf_prune import references
 from meshmatch.shapes.formats.gltf_rig import Binding
-from meshmatch.shapes.formats.gltf_rigged import bake_transform, rigid_frame
+from meshmatch.shapes.formats.gltf_write import VERTICES
 
 _KINDS = ("bufferViews", "accessors", "images", "samplers", "textures", "materials", "meshes")
 _VARIANTS = "KHR_materials_variants"
 
 
-def joined(document: Document, added: Document, binding: Binding | None) -> bytes:
+def add_scene(document: Document, added: Document, binding: Binding | None) -> bytes:
     """Return a scene as a glb, with the meshes of another scene added, one new node each, at their world positions.
 
     Parameters

@@ -14,11 +14,11 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Floats32
 from meshmatch.derived import derived
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import shortest_turns, unit
+from meshmatch.geometry.triangles import normalized, rotations_between
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.blend_shapes import BlendShapes, WeightClip, shape_normals
 from meshmatch.shapes.formats import check_element_count, gltf_vrm
-from meshmatch.shapes.formats.gltf import Document, understood
+from meshmatch.shapes.formats.gltf import Document, parse_document
 from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes, vertex_frames
 from meshmatch.shapes.shape import Shape
 
@@ -29,7 +29,7 @@ _MAX_VALUE = 1e18
 
 def read_morphs(path: Path, data: bytes) -> BlendShapes:
     """Read the blendshapes of a scene, for the vertices of `gltf.read` in their order; `InputError` if there are none."""
-    return understood(path, data, "morph targets make", _read_morphs)
+    return parse_document(path, data, "morph targets make", _read_morphs)
 
 
 def with_morphs(document: Document, shape: Shape, added: BlendShapes, turn: Float[Floats, "3 3"]) -> bytes:
@@ -227,15 +227,15 @@ def _add_targets(
     frames = vertex_frames(document, number, primitive)
     to_local, stored = np.linalg.pinv(frames), np.empty((0, 3))
     if normals is not None:
-        stored = unit(document.accessor(primitive["attributes"]["NORMAL"]))
-        scene_normals = unit(np.einsum("vji,vj->vi", to_local, stored))
+        stored = normalized(document.accessor(primitive["attributes"]["NORMAL"]))
+        scene_normals = normalized(np.einsum("vji,vj->vi", to_local, stored))
     for k, move in enumerate(moves):
         local_moves = np.einsum("vij,vj->vi", to_local, move)
         target = {"POSITION": editor.add_sparse(local_moves.astype("<f4"), bounds=True)}
         if normals is not None:
             rest, deformed = normals[0], normals[1 + k]
-            rotated = np.einsum("vij,vj->vi", shortest_turns(rest, deformed), scene_normals)
-            rotated = unit(np.einsum("vji,vj->vi", frames, rotated)) - stored  # displacements of local normals
+            rotated = np.einsum("vij,vj->vi", rotations_between(rest, deformed), scene_normals)
+            rotated = normalized(np.einsum("vji,vj->vi", frames, rotated)) - stored  # displacements of local normals
             rotated[(deformed == rest).all(axis=1)] = 0.0
             target["NORMAL"] = editor.add_sparse(rotated.astype("<f4"))
         yield target

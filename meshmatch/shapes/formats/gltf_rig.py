@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Brief, Float, Floats, Floats32, Int, Ints
+from meshmatch.arrays import Float, Floats, Floats32, Int, Ints, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
-from meshmatch.shapes.formats.gltf import Document, local_matrix, understood
+from meshmatch.shapes.formats.gltf import Document, local_matrix, parse_document
 from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 
 Moved = Literal["rotation", "translation", "scale"]
@@ -30,7 +30,7 @@ _MAX_VALUE = 1e18  # its square is still within the range of 32-bit floats
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Track(Brief):
+class Track(ShortRepr):
     """Animation of one property of one node in a clip.
 
     A cubic spline has three values per time: in-tangent, value and out-tangent.
@@ -44,7 +44,7 @@ class Track(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Clip(Brief):
+class Clip(ShortRepr):
     """An animation of a skeleton."""
 
     name: str
@@ -53,7 +53,7 @@ class Clip(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Rig(Brief):
+class Rig(ShortRepr):
     """A skeleton: joints, the nodes above them and empty nodes below them; parents come before their children.
 
     Rotations, translations and scales are those of each node relative to its parent, in the pose of the file.
@@ -80,7 +80,7 @@ class Rig(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Binding(Brief):
+class Binding(ShortRepr):
     """A skeleton and its skin weights for the vertices of a scene.
 
     Attributes
@@ -118,7 +118,7 @@ def read_rig(path: Path, data: bytes) -> Rig:
 
     `InputError` if there is none, if it is mirrored or too large, or if the file is damaged.
     """
-    return understood(path, data, "skeleton makes", _rig)
+    return parse_document(path, data, "skeleton makes", _rig)
 
 
 def _rig(document: Document) -> Rig:

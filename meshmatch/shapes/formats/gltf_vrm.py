@@ -44,8 +44,8 @@ def check_character(file: Path | None, output: Path) -> None:
     target_name, hint = "the target" if file is None else file.name, "end the name in .glb"
     checks = False, False
     if file is not None and file.suffix.lower() in gltf.SUFFIXES:
-        checks = gltf.understood(
-            file, read_bytes(file), "scene makes", lambda each: (is_character(each.json), each.draws_copies())
+        checks = gltf.parse_document(
+            file, read_bytes(file), "scene makes", lambda each: (is_character(each.json), each.uses_instancing())
         )
     if not checks[0]:
         raise OptionError(f"{output.name} would be no character: {target_name} has no VRM extension", hint)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats
 from meshmatch.errors import InputError
-from meshmatch.shapes.companions import beside
+from meshmatch.shapes.companions import find_companion
 from meshmatch.shapes.formats import Raw, damaged, parse_numbers
 from meshmatch.shapes.formats.label_surfaces import CODE_BYTES, label_surfaces
 from meshmatch.shapes.input_files import check_memory, read_bytes, suffix_of
@@ -272,7 +272,7 @@ def _voxel_type(name: str, voxel_types: Mapping[str, str], word: str) -> str:
 
 def _read_data_file(path: Path, name: str) -> bytes:
     """Read the data file, in the same folder, that a header refers to."""
-    file = beside(path.parent, name)
+    file = find_companion(path.parent, name)
     if file is None:
         problem = f"{path.name}: there is no file {name[:80]} in its folder, which should contain its voxels"
         raise InputError(problem, "keep both together, or save a .nrrd or .mha, which is one file")

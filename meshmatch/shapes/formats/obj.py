@@ -1,7 +1,7 @@
 """Read and write Wavefront OBJ files: positions, faces and vertex colors; textured meshes are written only.
 
-Reading ignores texture and normal indices, so that seams do not split vertices; `meshmatch.shapes.formats.obj_look` reads
-texture coordinates and materials.
+Reading ignores texture and normal indices, so that seams do not split vertices; texture coordinates and materials are read
+by `meshmatch.shapes.formats.obj_appearance`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
 from meshmatch.shapes.formats import Raw, columns, damaged, parse_numbers, words_per_line
 from meshmatch.shapes.formats.polygons import triangles_of
-from meshmatch.shapes.input_files import check_text
+from meshmatch.shapes.input_files import check_text_size
 from meshmatch.shapes.shape import Shape
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def read(path: Path, data: bytes) -> Raw:
     name = path.name
     if b"\0" in data[:4096]:
         raise InputError(f"{name} is not an obj file: it is binary", formats.WRONG_SUFFIX)
-    check_text(name, data)
+    check_text_size(name, data)
     data = join_lines(data)
     text, vertex_lines, faces_text, sizes, face_lines = entries_and_faces(name, data, b"v")
     formats.check_element_count(
@@ -100,7 +100,7 @@ def _colors(name: str, data: bytes, values: Floats, counts: Ints) -> Floats | No
     if has_color.any():
         width = 4 if (counts == 7).all() else 3
         starts = (np.cumsum(counts) - counts)[has_color]
-        parsed = formats.painted(values[starts[:, None] + np.arange(3, 3 + width)])
+        parsed = formats.rgba_from_channels(values[starts[:, None] + np.arange(3, 3 + width)])
         if has_color.all():
             return parsed
         colors = np.ones((len(counts), 4))
@@ -121,7 +121,7 @@ def _colors(name: str, data: bytes, values: Floats, counts: Ints) -> Floats | No
             return _fill_colors(
                 name,
                 "colors (vc)",
-                formats.painted(columns(parse_numbers(name, text), counts_per_line, 0, 3)),
+                formats.rgba_from_channels(columns(parse_numbers(name, text), counts_per_line, 0, 3)),
                 len(counts),
             )
     return None
@@ -189,7 +189,7 @@ def write(path: Path, shape: Shape) -> None:
     _write(path, [*lines, *(f"f {a} {b} {c}" for a, b, c in (shape.faces + 1).tolist())])
 
 
-def write_textured(path: Path, mesh: formats.Textured, mtl: str, material: str) -> None:
+def write_textured(path: Path, mesh: formats.TexturedMesh, mtl: str, material: str) -> None:
     """Write a textured mesh; texture coordinates are indexed separately, so that seams do not split vertices.
 
     `mtl` is the name of the material file in the same folder, `material` that of its only material.

@@ -14,7 +14,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.geometry.triangles import unit
+from meshmatch.geometry.triangles import normalized
 from meshmatch.shapes.formats import columns, lines_starting_with, parse_numbers, without_comments, words_per_line
 from meshmatch.shapes.formats.obj import (
     SPACED_SLASH,
@@ -153,7 +153,7 @@ def with_colors(name: str, data: bytes, colors: Float[Floats, "V 4"]) -> bytes:
     return text
 
 
-def beyond_triangles(name: str, data: bytes) -> list[str]:
+def content_beyond_triangles(name: str, data: bytes) -> list[str]:
     """Kinds of content besides the triangles of one mesh with one material, in words ("polygons", "groups", ...)."""
     data = join_lines(data)
     normals, _, sizes = entries_and_faces(name, data, b"vn")[1:4]
@@ -222,4 +222,4 @@ def _turned_normals(name: str, data: bytes, turns: Float[Floats, "V 3 3"]) -> Fl
     rotated = np.full(normals.shape, np.nan)
     rotated[normal_index] = 0.0
     np.add.at(rotated, normal_index, np.einsum("nij,nj->ni", turns[vertices[used_corners]], normals[normal_index]))
-    return unit(rotated)
+    return normalized(rotated)

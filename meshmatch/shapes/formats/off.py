@@ -12,7 +12,7 @@ from meshmatch.errors import InputError, warn
 from meshmatch.shapes import formats
 from meshmatch.shapes.formats import NO_FACES, Raw, columns, damaged, parse_numbers, words_per_line
 from meshmatch.shapes.formats.polygons import triangles_of
-from meshmatch.shapes.input_files import check_text
+from meshmatch.shapes.input_files import check_text_size
 from meshmatch.shapes.shape import Shape
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)OFF\b|\s*((?:ST)?C?N?)OFF(?=\d)")
@@ -22,7 +22,7 @@ _COUNTS = re.compile(rb"\s*(\d{1,15})\s+(\d{1,15})(?!\d)(?:[ \t]+\d+)?")
 def read(path: Path, data: bytes) -> Raw:
     """Read vertices, faces and the colors of vertices, or else of faces; normals are skipped."""
     name = path.name
-    check_text(name, data)
+    check_text_size(name, data)
     text = formats.without_comments(data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _HEADER.match(text)
     if not header:
@@ -57,17 +57,17 @@ def read(path: Path, data: bytes) -> Raw:
         raise damaged(name, "a face has fewer corners than it says")
     n_corners = corners.astype(np.int64)
     formats.check_element_count(name, len(data), V, max(int(n_corners.sum()) - 2 * F, 0), text=True)
-    corner = formats.indices(name, faces[formats.runs(starts + 1, n_corners)])
+    corner = formats.indices(name, faces[formats.concatenated_ranges(starts + 1, n_corners)])
     triangles = corner[triangles_of(name, verts, corner, n_corners)]
     formats.warn_if_no_triangles(name, F, triangles)
     face_colors = None if colors is not None else _face_colors(faces, starts + 1 + n_corners, sizes - 1 - n_corners)
     if face_colors is not None and len(triangles):
         warn(f"{name} has colors of faces: each vertex gets the mean of those around it")
-        colors = formats.colors_of_faces(V, corner, np.repeat(face_colors, n_corners, axis=0))
+        colors = formats.vertex_colors_from_faces(V, corner, np.repeat(face_colors, n_corners, axis=0))
     return Raw(verts, triangles, colors)
 
 
-def beyond_triangles(name: str, data: bytes) -> list[str]:
+def content_beyond_triangles(name: str, data: bytes) -> list[str]:
     """Kinds of content besides triangles and their colors, in words; the file must have passed `read`."""
     text = formats.without_comments(data).replace(b"\r", b"\n")
     header = _HEADER.match(text)
@@ -94,7 +94,7 @@ def _colors(kind: bytes, rows: Floats, widths: Ints) -> Floats | None:
             return None
         if not ((values >= 0) & (values <= 255)).all():
             return None
-    return formats.painted(values)
+    return formats.rgba_from_channels(values)
 
 
 def _face_colors(faces: Floats, starts: Ints, widths: Ints) -> Floats | None:
@@ -107,7 +107,7 @@ def _face_colors(faces: Floats, starts: Ints, widths: Ints) -> Floats | None:
         return None
     width = int(widths[colored].min())
     colors = np.ones((len(widths), 4))
-    colors[colored] = formats.painted(faces[starts[colored, None] + np.arange(width)])
+    colors[colored] = formats.rgba_from_channels(faces[starts[colored, None] + np.arange(width)])
     return colors
 
 

@@ -20,10 +20,10 @@ from meshmatch.shapes.formats import (
     WRONG_SUFFIX,
     Raw,
     check_element_count,
-    colors_of_faces,
     damaged,
     indices,
     strips,
+    vertex_colors_from_faces,
     warn_if_no_triangles,
 )
 from meshmatch.shapes.formats.ply_rows import TYPES, Body, Element, Property
@@ -78,7 +78,7 @@ def read(path: Path, data: bytes) -> Raw:
     for (corners, sizes), element in zip(lists, content.faces, strict=True) if colors is None else ():
         face_colors = _colors(element)
         if face_colors is not None and len(face_colors):
-            colors = colors_of_faces(len(verts), corners, np.repeat(face_colors, sizes, axis=0))
+            colors = vertex_colors_from_faces(len(verts), corners, np.repeat(face_colors, sizes, axis=0))
             warn(f"{name} has a color for each face: each vertex gets the mean of the faces around it")
             break
     return Raw(verts, triangles, colors)

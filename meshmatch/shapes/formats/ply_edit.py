@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import warn
-from meshmatch.shapes.formats import damaged, runs
+from meshmatch.shapes.formats import concatenated_ranges, damaged
 from meshmatch.shapes.formats.ply import CHANNELS, END, KINDS, Columns, Content, color_properties, corners_of, parsed
 from meshmatch.shapes.formats.ply_rows import TYPES, Element, Property
 from meshmatch.shapes.formats.polygons import majority_of_triangles
@@ -75,7 +75,7 @@ class PlyFile:
         return candidate if matches and (content.order or candidate._lines is not None) else None
 
     @property
-    def beyond_triangles(self) -> list[str]:
+    def content_beyond_triangles(self) -> list[str]:
         """Kinds of content besides triangles and their colors, in words."""
         content = self.content
         names, polygons = [p.name for p in content.vertices.properties], False
@@ -283,5 +283,5 @@ def _packed(plan: _Plan, order: str) -> bytes:
     begins = np.cumsum(lengths, axis=0) - lengths + (ends - lengths.sum(axis=0))
     out = np.empty(int(lengths.sum()), np.uint8)
     for (values, sizes), begin in zip(parts, begins, strict=True):
-        out[runs(begin, sizes)] = values
+        out[concatenated_ranges(begin, sizes)] = values
     return out.tobytes()

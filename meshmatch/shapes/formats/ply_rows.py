@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Int, Ints
 from meshmatch.errors import InputError
-from meshmatch.shapes.formats import BASE_ELEMENTS, damaged, indices, parse_numbers, runs
-from meshmatch.shapes.input_files import check_text
+from meshmatch.shapes.formats import BASE_ELEMENTS, concatenated_ranges, damaged, indices, parse_numbers
+from meshmatch.shapes.input_files import check_text_size
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -56,7 +56,7 @@ class Body:
         self.data: Any = data
         self.max_items = 3 * (BASE_ELEMENTS + len(data) // (24 if self.text else 12))  # limit for items of lists
         if self.text:
-            check_text(name, data)
+            check_text_size(name, data)
             self.data, self.at = parse_numbers(name, data[start:]).view(np.uint8).data, 0
 
     def element(self, element: Element) -> dict[str, Any]:
@@ -137,7 +137,7 @@ class Body:
             if p.count_kind:
                 counts = np.maximum(indices(self.name, self._gather(starts, p.count_kind)), 0)
                 self._check_corners(int(counts.sum()))
-                items = runs(starts + self._dtype(p.count_kind).itemsize, counts, item_size)
+                items = concatenated_ranges(starts + self._dtype(p.count_kind).itemsize, counts, item_size)
                 found = self._gather(items, p.kind)
                 out[p.name] = found if p.kind[0] == "f" else indices(self.name, found), counts
             else:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from meshmatch.arrays import Bools, Float, Floats, Int, Ints
 from meshmatch.errors import warn
 from meshmatch.geometry.triangles import cross_product, dot
-from meshmatch.shapes.formats import fan, runs
+from meshmatch.shapes.formats import concatenated_ranges, fan
 from meshmatch.shapes.shape import LARGEST
 
 MAX_CORNERS = 16_384
@@ -61,7 +61,7 @@ def triangles_of(
 
     def places_of(polygons: Ints) -> Floats:
         """Positions of the corners of some polygons, one polygon after the other; NaN for corners without one."""
-        number = corners[runs(starts[polygons], sizes[polygons])]
+        number = corners[concatenated_ranges(starts[polygons], sizes[polygons])]
         found = verts[np.clip(number, 0, len(verts) - 1)]
         found[(number < 0) | (number >= len(verts)) | ~(np.abs(found) < LARGEST).all(axis=1)] = np.nan
         return found
@@ -76,7 +76,7 @@ def triangles_of(
     for batch in _batches(chosen, sizes):
         batch_sizes = sizes[batch]
         ears, complete = _clip_ears(_project(places_of(batch), batch_sizes), batch_sizes)
-        rows = runs(begins[batch][complete], counts[batch][complete])
+        rows = concatenated_ranges(begins[batch][complete], counts[batch][complete])
         shifted = ears[complete] + starts[batch][complete][:, None, None]
         triangles[rows] = shifted[np.arange(ears.shape[1]) < counts[batch][complete][:, None]]
     if len(chosen) < len(concave):
@@ -225,7 +225,7 @@ def _clip_ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
         if len(stuck):
             n_refills[stuck] += 1
             stuck_row, corner = np.nonzero(remaining[stuck])
-            queue[stuck[stuck_row], runs(tail[stuck], n_remaining[stuck])] = corner
+            queue[stuck[stuck_row], concatenated_ranges(tail[stuck], n_remaining[stuck])] = corner
             tail[stuck] += n_remaining[stuck]
             alive &= n_refills < 3
         if alive.sum() < 0.75 * len(number):

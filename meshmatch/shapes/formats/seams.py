@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.geometry.triangles import cross_product, dot, unit
+from meshmatch.geometry.triangles import cross_product, dot, normalized
 
 
 def split_at_seams(
@@ -44,14 +44,14 @@ def vertex_tangents(
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (u1, v1), (u2, v2) = ((corner_uv[:, k] - corner_uv[:, 0]).T[:, :, None] for k in (1, 2))
     orientation = np.sign(u1 * v2 - u2 * v1)  # negative where the image is not mirrored, since v points down
-    tangent = unit(orientation * (v2 * edge1 - v1 * edge2))
+    tangent = normalized(orientation * (v2 * edge1 - v1 * edge2))
     total, side = np.zeros((len(verts), 3)), np.zeros(len(verts))
     for k in range(3):
-        a, b = (unit(corners[:, (k + step) % 3] - corners[:, k]) for step in (1, 2))
+        a, b = (normalized(corners[:, (k + step) % 3] - corners[:, k]) for step in (1, 2))
         angle = np.arccos(np.clip(dot(a, b), -1.0, 1.0))
         vertex = faces[:, k]
         normal = normals[vertex]
-        projected = unit(tangent - dot(tangent, normal)[:, None] * normal)
+        projected = normalized(tangent - dot(tangent, normal)[:, None] * normal)
         for axis in range(3):
             total[:, axis] += np.bincount(vertex, angle * projected[:, axis], len(verts))
         side -= np.bincount(vertex, angle * orientation[:, 0], len(verts))
@@ -60,4 +60,4 @@ def vertex_tangents(
     if len(undefined):  # without a defined tangent, any direction orthogonal to the normal
         axis = np.eye(3)[np.abs(normals[undefined]).argmin(axis=1)]
         total[undefined] = cross_product(normals[undefined], axis)
-    return np.column_stack([unit(total), np.where(side < 0, -1.0, 1.0)])
+    return np.column_stack([normalized(total), np.where(side < 0, -1.0, 1.0)])

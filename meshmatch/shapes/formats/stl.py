@@ -25,7 +25,7 @@ from meshmatch.shapes.formats import (
     parse_numbers,
     words_per_line,
 )
-from meshmatch.shapes.input_files import check_text
+from meshmatch.shapes.input_files import check_text_size
 from meshmatch.shapes.shape import Shape
 
 _HEADER_BYTES, _ROW_BYTES = 84, 50  # bytes
@@ -94,7 +94,7 @@ def _plausible(corners: Float[Floats, "F 3 3"]) -> Bools:
 
 
 def _text(name: str, data: bytes) -> Float[Floats, "V 3"]:
-    check_text(name, data)
+    check_text_size(name, data)
     text = _NAMES.sub(rb"\1", data.replace(b"\r", b"\n").lower())
     check_element_count(name, len(data), text.count(b"vertex") * 4 // 3, text=True)
     if b"vertex" not in text:

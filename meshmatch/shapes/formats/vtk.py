@@ -46,7 +46,7 @@ def read(path: Path, data: bytes) -> Raw:
     return _File(path.name, data).raw()
 
 
-def beyond_triangles(name: str, data: bytes) -> list[str]:
+def content_beyond_triangles(name: str, data: bytes) -> list[str]:
     """Kinds of content besides triangles and their colors, in words; the file must have passed `read`."""
     polygons = any(
         int(size) > 3 * (int(count) - 1) if is_version_5 else int(size) > 4 * int(count)

@@ -10,7 +10,14 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError, warn
-from meshmatch.shapes.formats import Raw, check_element_count, damaged, runs, strips, warn_if_no_triangles
+from meshmatch.shapes.formats import (
+    Raw,
+    check_element_count,
+    concatenated_ranges,
+    damaged,
+    strips,
+    warn_if_no_triangles,
+)
 from meshmatch.shapes.formats.polygons import triangles_of
 
 _POINTS, _LINES = (0, 1, 2), (3, 4, 21)
@@ -59,7 +66,7 @@ def build_raw(
             if not len(rows):
                 continue
             n_faces += len(rows)
-            corners, sizes = each.corners[runs(starts[rows], each.sizes[rows])], each.sizes[rows]
+            corners, sizes = each.corners[concatenated_ranges(starts[rows], each.sizes[rows])], each.sizes[rows]
             if cell_types == (_STRIP,):
                 triangles.append(strips(corners, sizes))
                 continue

@@ -28,10 +28,10 @@ from meshmatch.shapes.formats import (
     WRONG_SUFFIX,
     Raw,
     check_element_count,
+    concatenate_colors,
     damaged,
-    joined_colors,
-    painted,
     parse_numbers,
+    rgba_from_channels,
 )
 from meshmatch.shapes.formats.vtk_cells import Cells, build_raw
 from meshmatch.shapes.input_files import read_bytes
@@ -168,7 +168,7 @@ class _File:
             colors.append(self._colors(piece, count))
             cells += [each.moved(first, count) for each in self._cells(piece)]
             first += count
-        vertex_colors = joined_colors(colors, counts) if pieces else None
+        vertex_colors = concatenate_colors(colors, counts) if pieces else None
         return build_raw(self.name, self.size, np.concatenate(verts), cells, vertex_colors)
 
     def point_arrays(self) -> dict[str, NDArray[Any]]:
@@ -220,7 +220,7 @@ class _File:
             if element.get("type") == "UInt8" and channels in ("3", "4"):
                 found = self._array(element)
                 if found.size == count * int(channels):
-                    return painted(found.reshape(count, -1) / 255.0)
+                    return rgba_from_channels(found.reshape(count, -1) / 255.0)
         return None
 
     def named(self, piece: ElementTree.Element, group: str, name: str | None) -> NDArray[Any] | None:

@@ -76,7 +76,7 @@ class VtpFile:
         return array_names(self.name, self.data)
 
     @property
-    def beyond_triangles(self) -> list[str]:
+    def content_beyond_triangles(self) -> list[str]:
         """Kinds of content besides triangles and their colors, in words."""
         sizes = None if self.surface is None else self.surface.sizes
         polygons = sizes is not None and bool((sizes > 3).any())

@@ -103,7 +103,7 @@ def main(
     modules: Annotated[Path, Option(help="npm's folder node_modules")] = Path("node_modules"),
     tools: Annotated[str, Option(help=f"of {', '.join(TOOLS)}")] = ",".join(TOOLS),
 ) -> runner.Report:
-    chosen = runner.names_of(tools, TOOLS, "tool")
+    chosen = runner.split_names(tools, TOOLS, "tool")
     check_tools(chosen, modules)
     pictures = output / "pictures"
     make_folder(pictures)

@@ -14,7 +14,7 @@ from meshmatch import cli
 from meshmatch.errors import OutputError
 from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats import Textured
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.shape import Shape
@@ -130,7 +130,7 @@ def _write_inputs(folder: Path, data: Path) -> dict[str, str]:
         uv, look = load_coordinates(found["dancer"], body), load_appearance(found["dancer"], body)
         image = look.materials[0].image
         assert uv is not None and image is not None
-        save_textured(found["dressed"], Textured(body.verts, body.faces, uv), image)
+        save_textured(found["dressed"], TexturedMesh(body.verts, body.faces, uv), image)
     found["vrm"].write_bytes(_as_vrm(found["man"]))
     return {key: shlex.quote(str(path)) for key, path in found.items()}
 
