@@ -18,6 +18,7 @@ from meshmatch.arrays import ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import rotations_between
 from meshmatch.outputs import as_path, check_new_folder, folder_on_success, make_unique, replace_on_success
+from meshmatch.progress import Progress, ProgressCallback
 from meshmatch.shapes import tables
 from meshmatch.shapes.blend_shape_files import load_blend_shapes, save_blend_shapes
 from meshmatch.shapes.blend_shapes import BlendShapes, shape_normals
@@ -156,6 +157,7 @@ def transfer_shapes(
     match: MapLike = None,
     *,
     shapes: BlendShapes | str | Path | Sequence[str | Path] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> BlendShapesResult:
     """Transfer blendshapes (morph targets) from the source to the target: facial expressions, pose corrections.
 
@@ -170,6 +172,8 @@ def transfer_shapes(
     shapes
         The blendshapes, if they are not in the source's file: a glTF scene, an .npz, or meshes with the vertices of the
         source, as a list of files or a folder.
+    progress
+        As in `match`.
 
     Returns
     -------
@@ -199,6 +203,7 @@ def transfer_shapes(
     given = shapes if isinstance(shapes, BlendShapes) else load_blend_shapes(shapes, a)
     maps = find_maps(a, b, match)
     began = time.monotonic()
+    Progress(progress, b.name, "transferring displacements")(0.0)
     with thread_limit(1):
         moves = carry_moves(given.moves, maps.forward, maps.backward, a, b)
     is_still = [bool(old.any()) and not new.any() for old, new in zip(given.moves, moves, strict=True)]

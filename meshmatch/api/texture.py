@@ -194,6 +194,7 @@ def transfer_texture(
             check_layout(shape, look)
             atlas = None
         else:
+            Progress(progress, mesh.name, "texture coordinates")(0.0)
             atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons, options.tiles)
     unwrapped = time.monotonic() - began
     maps = find_maps(shape, mesh, match)

@@ -50,7 +50,8 @@ def transfer_shapes(
     suffix = check_shapes_output(output)
     with transfer.outputs(*(shapes or ()), files=[output] if suffix else ()) as temporary:
         given = None if shapes is None else shapes[0] if len(shapes) == 1 else shapes
-        result = meshmatch.transfer_shapes(source, target, transfer, shapes=given)
+        with console.progress() as report:
+            result = meshmatch.transfer_shapes(source, target, transfer, shapes=given, progress=report)
         if temporary:
             write_shapes(result, output, *temporary)
         else:

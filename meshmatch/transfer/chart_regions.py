@@ -52,7 +52,7 @@ _EFFORT, _MIN_EFFORT, _ATTEMPT_COST = 8, 200_000, 300
 
 @dataclass
 class _Surface:
-    """Triangles, their adjacency, and the work budget that is left for flattening them."""
+    """Triangles, their adjacent pairs, and the work budget that is left for flattening them."""
 
     verts: Floats
     faces: Ints
@@ -67,7 +67,6 @@ class _Surface:
         self.areas, self.normals = triangle_areas(self.verts, self.faces), normalized(vectors)
         self.centers = self.verts[self.faces].mean(axis=1)
         self.total = float(self.areas.sum())
-        self.adjacency = self.graph(self.length)
         self.budget = _EFFORT * len(self.faces) + _MIN_EFFORT
 
     def graph(self, weights: Floats) -> csr_array:

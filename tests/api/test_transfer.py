@@ -200,7 +200,11 @@ def test_a_texture_is_baked_and_saved(pair: tuple[Shape, Shape, VertexMap], tmp_
     source, target, found = pair
     red = Shape(source.verts, source.faces, "red", np.tile([1.0, 0, 0, 1], (source.V, 1)))
     options = meshmatch.BakeOptions(size=64)
-    result = meshmatch.transfer_texture(red, target, found, options=options)
+    stages: list[str] = []
+    result = meshmatch.transfer_texture(
+        red, target, found, options=options, progress=lambda stage, name, share: stages.append(stage)
+    )
+    assert list(dict.fromkeys(stages)) == ["texture coordinates", "baking"]
     assert result.baked.image.shape == (64, 64, 4)
     assert (np.median(result.baked.image.reshape(-1, 4), axis=0)[:3] == [255, 0, 0]).all()
     result.save(tmp_path / "b.glb")
