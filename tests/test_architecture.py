@@ -186,7 +186,7 @@ def circles(modules: dict[str, ast.Module]) -> list[str]:
         edges = {module: edges[module] & kept for module in kept}
 
 
-def long_modules(folder: Path, limit: int = 500) -> list[str]:
+def long_modules(folder: Path, limit: int = 550) -> list[str]:
     """Modules of more lines than that: each is asking to be two."""
     lines = {path: path.read_text(encoding="utf-8").count("\n") for path in folder.rglob("*.py")}
     return [f"{path.relative_to(folder)}: {count} lines" for path, count in lines.items() if count > limit]
@@ -302,9 +302,9 @@ def test_no_module_is_too_long() -> None:
 
 
 def test_the_rule_sees_a_module_that_is_too_long(tmp_path: Path) -> None:
-    (tmp_path / "fine.py").write_text("a = 1\n" * 500)
-    (tmp_path / "long.py").write_text("a = 1\n" * 501)
-    assert long_modules(tmp_path) == ["long.py: 501 lines"]
+    (tmp_path / "fine.py").write_text("a = 1\n" * 550)
+    (tmp_path / "long.py").write_text("a = 1\n" * 551)
+    assert long_modules(tmp_path) == ["long.py: 551 lines"]
 
 
 @pytest.mark.parametrize(
