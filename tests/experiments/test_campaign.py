@@ -1,4 +1,4 @@
-"""Bodies that nobody drew for training: drawn again alike, with their truth, and counted by verdict and error."""
+"""Bodies that nobody drew for training: drawn again alike, with their truth, and count_by_error by verdict and error."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from meshmatch.api.matcher import Matcher
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import campaign
-from meshmatch.experiments.bench.campaign import POSES, Body, People, band_of, counted
+from meshmatch.experiments.bench.campaign import POSES, Body, People, band_of, count_by_error
 from meshmatch.experiments.makers.human_bodies import unseen_bodies
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.judge.features import FitFeatures
@@ -72,7 +72,7 @@ def test_bands_of_error(error: float, band: str) -> None:
 
 def test_what_is_counted() -> None:
     rows = [{"verdict": verdict, "error": error} for verdict, error in (("good", 1.0), ("fair", 2.0), ("fair", 50.0))]
-    found = {row["error"]: row for row in counted([*rows, {"verdict": "refused"}])}
+    found = {row["error"]: row for row in count_by_error([*rows, {"verdict": "refused"}])}
     assert list(found) == ["0 to 5 cm", "5 to 8 cm", "8 to 15 cm", "15 to 30 cm", "over 30 cm"]
     assert (found["0 to 5 cm"]["good"], found["0 to 5 cm"]["fair"], found["0 to 5 cm"]["all"]) == (1, 1, 2)
     assert found["over 30 cm"] == {"error": "over 30 cm", "good": 0, "fair": 1, "poor": 0, "all": 1}

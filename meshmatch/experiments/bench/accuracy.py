@@ -1,9 +1,9 @@
-"""The development benchmark, whole: every shape fitted once, every pair mapped and measured.
+"""The development benchmark: every shape is fitted once, and every pair is mapped and measured.
 
-A pair that cannot be matched is not left out: it counts as the map that sends every vertex to vertex 0. --limit-pairs
-measures a stated part and says so.
+A pair that cannot be matched counts as the map of every vertex to vertex 0. --limit-pairs measures a subset of the pairs,
+and the tables say so.
 
---output FOLDER keeps fits and maps: the same command goes on where it was stopped.
+--output FOLDER keeps fits and maps: the same command resumes where it was stopped.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def _fit_one(bench: BenchSet, method: Method, name: str) -> tuple[str, Any, floa
         fit = method.fit(shape)
     except MeshmatchError as error:
         fit = error
-    # one that was kept took longer than to read it
+    # a stored fit has the time that it took to make, not to read
     return name, fit, max(time.perf_counter() - started, getattr(fit, "seconds", 0.0))
 
 
 def _map_one(
     bench: BenchSet, method: Method, kept: Path | None, task: tuple[Pair, tuple[Any, Any]]
 ) -> tuple[Pair, Ints | MeshmatchError, float]:
-    """A map by its pair and their fits; in the folder ``kept`` it is looked for, and left."""
+    """Map a pair from its two fits; the map is read from the folder ``kept``, or computed and written there."""
     pair, fits = task
     for fit in fits:
         if isinstance(fit, MeshmatchError):
@@ -80,7 +80,7 @@ def _map_one(
     return pair, index, seconds
 
 
-def _each(task: Any, items: Sequence[Any], threads: int, jobs: int) -> Iterator[Any]:
+def _run_tasks(task: Any, items: Sequence[Any], threads: int, jobs: int) -> Iterator[Any]:
     if jobs <= 1:
         set_threads(threads)
         yield from map(task, items)
@@ -92,7 +92,7 @@ def _each(task: Any, items: Sequence[Any], threads: int, jobs: int) -> Iterator[
 
 @dataclass(frozen=True)
 class SetRun:
-    """One set, matched and measured."""
+    """Results of one set: errors, times, failures and fits."""
 
     scores: SetScores
     fit_seconds: dict[str, float]
@@ -101,7 +101,7 @@ class SetRun:
     fits: dict[str, Any]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, those of each kind of pair, each fit's own judgement, and the times."""
+        """Return a JSON record of the scores, overall and by group of pairs, the verdict on each fit, and the times."""
         record = self.scores.as_dict()
         record["groups"] = {part.group: part.as_dict() for part in self.scores.groups()}
         record["failed"] = [[*pair, reason] for pair, reason in self.failed.items()]
@@ -131,21 +131,21 @@ def run_set(
     threads: int = 1,
     kept: Path | None = None,
 ) -> SetRun:
-    """Fit every shape of ``pairs`` once, map every pair, measure all of them.
+    """Fit every shape of ``pairs`` once, map every pair, and measure all maps.
 
-    With ``kept``, a folder, maps are written there, and those that are there are not made again.
+    ``kept`` is a folder of maps: existing ones are read, new ones are written.
     """
     names = sorted({name for pair in pairs for name in pair}, key=bench.shapes.index)
     fits: dict[str, Any] = {}
     fit_seconds: dict[str, float] = {}
-    work = _each(partial(_fit_one, bench, method), names, threads, jobs)
+    work = _run_tasks(partial(_fit_one, bench, method), names, threads, jobs)
     for name, fit, seconds in runner.track(work, f"{bench.name}: fitting", len(names)):
         fits[name], fit_seconds[name] = fit, seconds
     maps: dict[Pair, Ints] = {}
     map_seconds: dict[Pair, float] = {}
     failed: dict[Pair, str] = {}
     tasks = [(pair, (fits[pair[0]], fits[pair[1]])) for pair in pairs]
-    work = _each(partial(_map_one, bench, method, kept), tasks, threads, jobs)
+    work = _run_tasks(partial(_map_one, bench, method, kept), tasks, threads, jobs)
     for pair, index, seconds in runner.track(work, f"{bench.name}: mapping", len(pairs)):
         if isinstance(index, MeshmatchError):
             failed[pair] = index.message
@@ -158,7 +158,7 @@ def run_set(
 
 
 def scores_table(sets: Sequence[SetScores]) -> Table:
-    """A row for each set, and one for each kind of pair in it."""
+    """Build a table with a row for each set and for each group of pairs in it."""
     rows = []
     for whole in sets:
         for scores in (whole, *whole.groups()):
@@ -187,11 +187,11 @@ def main(
     jobs: runner.Jobs = 1,
     threads: runner.Threads = 1,
     cache: runner.Cache = None,
-    output: Annotated[Path | None, Option(help="keep fits and maps in this folder, and go on with those there")] = None,
-    curve: Annotated[Path | None, Option(help="draw the cumulative curves into this file")] = None,
+    output: Annotated[Path | None, Option(help="keep fits and maps in this folder, and reuse those there")] = None,
+    curve: Annotated[Path | None, Option(help="draw the cumulative error curves into this file")] = None,
 ) -> runner.Report:
     benches = [load_set(name, data) for name in runner.split_names(sets, ALL_SETS, "set")]
-    weights = model if model == NO_MODEL else as_model(model).card.weights_sha256  # a wrong name would cost every pair
+    weights = model if model == NO_MODEL else as_model(model).card.weights_sha256  # fails early for an unknown model
     if output is not None:
         asked = {"weights": weights, "refine": refine, "seed": seed, "threads": threads}
         asked |= {"quick": True} if quick else {}

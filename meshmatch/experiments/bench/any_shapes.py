@@ -1,14 +1,14 @@
-"""Two shapes of any kind, matched without a model: hand-picked points of the SHREC'07 classes, and no pair left out.
+"""Matching any two shapes of a class without a model, measured at hand-picked keypoints of the SHREC'07 classes.
 
-Every ordered pair of six shapes of each class. The error is the mean distance along the target's edges between where the
-keypoints of the source arrive and the target's own, in units of sqrt(area), times 100: the best of the symmetries that the
-class has. Those are in its ``symmetry.txt``; where there is none, as of chairs, they are the turns and reflections of
-its keypoints that most of its shapes have, and those that either shape of the pair has: a round table may be turned by
-a leg. Of table 141 the points of two legs are exchanged against those of its top, unlike those of all other tables: they
-are put back, and a last row says what the mean is as they are marked.
+All ordered pairs of six shapes of each class are matched. The error is the mean distance, along the target's edges, between
+the mapped keypoints of the source and those of the target, in units of sqrt(area), times 100; the smallest over the
+symmetries of the class. These are read from its ``symmetry.txt``. A class without that file, such as chairs, has the
+rotations and reflections of its keypoints that at least half of its shapes have, and those of either shape of the pair: a
+round table may be turned by one leg. In table 141 the keypoints of two legs are exchanged between floor and top, unlike in
+all other tables. They are corrected, and a last row gives the mean for the keypoints as marked.
 
-Bearings, cups and mechanical parts can turn in themselves, so that only their verdicts count: how many of those maps are
-told, as ambiguous or poor, whose error is over 20.
+Bearings, cups and mechanical parts are rotationally symmetric, so that only their verdicts count: how many of the maps
+with an error over 20 are reported as ambiguous or poor.
 """
 
 from __future__ import annotations
@@ -57,14 +57,15 @@ CLASSES = (
     *("ant", "armadillo", "bird", "bust", "fish", "fourleg", "glasses", "hand", "human", "octopus", "plier", "teddy"),
     *("chair", "plane", "table"),
 )
-TURNING = ("bearing", "cup", "mech")
-SHAPES = 6  # of each class
-OFF, FAR_OFF = 10.0, 20.0
-_ACROSS, _SIZE = 3, (480, 340)  # pairs in a row of a picture, and pixels of each
-# Of the keypoints' spread: how far a symmetry may miss them, at most and on average; one of most shapes, and one of a shape.
-_ALIKE, _EXACTLY = (0.4, 0.2), (0.25, 0.08)
-# Points that a shape has in another order than its class; of each point which one it is.
-_PUT_BACK = {("table", "141"): {6: 10, 7: 11, 10: 6, 11: 7}}
+ROTATING_CLASSES = ("bearing", "cup", "mech")
+SHAPES = 6  # per class
+MAX_ERROR, LARGE_ERROR = 10.0, 20.0
+_PAIRS_PER_ROW, _PAIR_SIZE = 3, (480, 340)  # pairs per row of the picture, and the size of each in pixels
+# (maximum, mean) distance between keypoints and their images under a symmetry, as a fraction of the keypoints' RMS radius:
+# for symmetries that most shapes of a class share, and for those of a single shape.
+_CLASS_TOLERANCES, _SHAPE_TOLERANCES = (0.4, 0.2), (0.25, 0.08)
+# Keypoints that a shape has in another order than its class: for each keypoint of the class, its index in the file.
+_REORDERED_KEYPOINTS = {("table", "141"): {6: 10, 7: 11, 10: 6, 11: 7}}
 _COLUMNS = {"class": "class", "pairs": "pairs:d", "mean": "mean:.1f", "median": "median:.1f", "under 10": "under:.0%"}
 _COLUMNS |= {
     "good": "good:d",
@@ -75,44 +76,56 @@ _COLUMNS |= {
     "error": "worst_error:.1f",
     "CPU s": "cpu:.1f",
 }
-_BESIDE = {"method": "method", "pairs": "pairs:d", "failed": "failed:d", "mean": "mean:.1f", "median": "median:.1f"}
-_BESIDE |= {"under 10": "under:.0%", "CPU s": "cpu:.1f"}
-_HELD_OUT = {"maps": "maps", "pairs": "pairs:d", "under 10": "right:d", "good": "good:d", "good over 10": "good_over:d"}
-_HELD_OUT |= {"under 10, good or fair": "right_not_poor:d"}
+_COMPARISON_COLUMNS = {
+    "method": "method",
+    "pairs": "pairs:d",
+    "failed": "failed:d",
+    "mean": "mean:.1f",
+    "median": "median:.1f",
+}
+_COMPARISON_COLUMNS |= {"under 10": "under:.0%", "CPU s": "cpu:.1f"}
+_HELD_OUT_COLUMNS = {
+    "maps": "maps",
+    "pairs": "pairs:d",
+    "under 10": "right:d",
+    "good": "good:d",
+    "good over 10": "good_over:d",
+}
+_HELD_OUT_COLUMNS |= {"under 10, good or fair": "right_not_poor:d"}
 
 
 def folder_of(name: str, data: Path) -> Path:
-    """Where the shapes of a class are."""
+    """Return the folder of a class of shapes."""
     return data / name if name in ("chair", "plane", "table") else data / "shrec07" / name
 
 
 def shapes_of(folder: Path) -> list[str]:
-    """Names of the first shapes of a class."""
+    """Return the names of the first `SHAPES` shapes of a class."""
     return sorted((file.stem for file in folder.glob("*.ply")), key=int)[:SHAPES]
 
 
 @cache
 def keypoints_of(folder: Path, shape: str, as_marked: bool = False) -> Int[Ints, " N"]:
-    """The vertices of the keypoints, in the order of the class, or as the file has them."""
+    """Return the keypoints' vertices in the order of the class, or with ``as_marked`` in that of the file."""
     found = np.load(folder / f"{shape}.keypoints.npy", allow_pickle=False).astype(np.int64)
-    moved = {} if as_marked else _PUT_BACK.get((folder.name, shape), {})
+    moved = {} if as_marked else _REORDERED_KEYPOINTS.get((folder.name, shape), {})
     return np.array([found[moved.get(k, k)] for k in range(len(found))])
 
 
 @cache
 def distances(folder: Path, shape: str, as_marked: bool = False) -> Float[Floats, "N V"]:
-    """From each keypoint to all vertices, along edges, in units of sqrt(area)."""
+    """Compute distances from each keypoint to all vertices, along edges, in units of sqrt(area)."""
     mesh, points = load_shape(folder / f"{shape}.ply"), keypoints_of(folder, shape, as_marked)
     found = dijkstra(edge_graph(mesh), directed=False, indices=points) / np.sqrt(mesh.area)
     return np.asarray(np.where(np.isfinite(found), found, found[np.isfinite(found)].max()))
 
 
 def symmetries(folder: Path, *shapes: str, as_marked: bool = False) -> list[Int[Ints, " N"]]:
-    """Permutations of the keypoints that a class allows, or one of these shapes, the identity first."""
+    """Return the permutations of the keypoints under the symmetries of a class or of one of ``shapes``, identity first."""
     plain = np.arange(len(keypoints_of(folder, shapes_of(folder)[0])))
     if not (folder / "symmetry.txt").exists():
-        own = [each for shape in shapes for each in _of_positions(folder, shape, _EXACTLY, as_marked)]
-        found = dict.fromkeys([tuple(plain.tolist()), *_of_most(folder, as_marked), *own])
+        own = [each for shape in shapes for each in _shape_symmetries(folder, shape, _SHAPE_TOLERANCES, as_marked)]
+        found = dict.fromkeys([tuple(plain.tolist()), *_common_symmetries(folder, as_marked), *own])
         return [np.array(each) for each in found]
     lines = (folder / "symmetry.txt").read_text().splitlines()
     orbits = [np.array(line.split(), np.int64) for line in lines if line.strip()]
@@ -136,8 +149,8 @@ Symmetry = tuple[int, ...]
 
 
 @cache
-def _of_positions(folder: Path, shape: str, most: tuple[float, float], as_marked: bool) -> frozenset[Symmetry]:
-    """Turns and reflections in the axes of a shape's file that bring keypoints onto keypoints."""
+def _shape_symmetries(folder: Path, shape: str, most: tuple[float, float], as_marked: bool) -> frozenset[Symmetry]:
+    """Find the octahedral rotations and reflections, about the file's axes, that map keypoints onto keypoints."""
     octahedral = Rotation.create_group("O").as_matrix()
     points = load_shape(folder / f"{shape}.ply").verts[keypoints_of(folder, shape, as_marked)]
     points = points - points.mean(0)
@@ -152,26 +165,31 @@ def _of_positions(folder: Path, shape: str, most: tuple[float, float], as_marked
     return frozenset(found)
 
 
-def _of_most(folder: Path, as_marked: bool) -> list[Symmetry]:
-    """The turns and reflections that half of the shapes have."""
+def _common_symmetries(folder: Path, as_marked: bool) -> list[Symmetry]:
+    """Find the rotations and reflections that at least half of the shapes of a class have."""
     names = shapes_of(folder)
-    votes = Counter(each for name in names for each in sorted(_of_positions(folder, name, _ALIKE, as_marked)))
+    votes = Counter(
+        each for name in names for each in sorted(_shape_symmetries(folder, name, _CLASS_TOLERANCES, as_marked))
+    )
     return [each for each, count in votes.items() if 2 * count >= len(names)]
 
 
 def error_of(folder: Path, pair: tuple[str, str], index: Int[Ints, " V"], as_marked: bool = False) -> float:
-    """Mean distance of where a map takes keypoints from where they belong, times 100; the best of the symmetries."""
+    """Compute the mean distance of mapped keypoints from the true ones, times 100; the smallest over the symmetries."""
     known, arrived = distances(folder, pair[1], as_marked), index[keypoints_of(folder, pair[0], as_marked)]
     return min(float(100 * known[each, arrived].mean()) for each in symmetries(folder, *pair, as_marked=as_marked))
 
 
 def errors_of(folder: Path, pair: tuple[str, str], index: Int[Ints, " V"]) -> dict[str, float]:
-    """The error, and that of the points as they are marked."""
+    """Return the error, and the error for the keypoints as they are marked in the files."""
     return {"error": error_of(folder, pair, index), "as_marked": error_of(folder, pair, index, as_marked=True)}
 
 
 def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[str, Any]:
-    """Error, verdict and cost of one pair; without a model and where both ways were tried, also what one gives alone."""
+    """Measure error, verdict and cost of one pair.
+
+    Without a model, ``one_way`` has the result of matching in one direction where both were tried.
+    """
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
     began = time.process_time()
     if model != NO_MODEL:
@@ -196,8 +214,10 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
 
 
 def judged(row: dict[str, Any]) -> dict[str, Any]:
-    """A pair with the verdict that the weights of now give it, unless a finer fit has its own: a work folder may be of a
-    run from which they were found."""
+    """Replace a pair's verdict by that of the current calibration, which may be newer than the pairs in a work folder.
+
+    Pairs that a refined fit judged keep their verdict.
+    """
     if "energy" not in row or row.get("finer"):
         return row
     calibration = DIRECT_BOTH_WAYS if row["one_way"] else DIRECT
@@ -218,19 +238,19 @@ def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, An
 
 
 def measure_by(method: Method, folder: Path, pair: tuple[str, str]) -> dict[str, Any]:
-    """Error and cost of another method on one pair; where it fails, of the map of everything to the first vertex."""
+    """Measure error and cost of another method on one pair; a failure counts as the map of everything to vertex 0."""
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
     began, failed = os.times(), False
     try:
         index = method.map(source, method.fit(source), target, method.fit(target)).index
     except InputError:
         index, failed = np.zeros(source.V, np.int64), True
-    spent = sum(os.times()[:4]) - sum(began[:4])  # of this process, and of those that it began
+    spent = sum(os.times()[:4]) - sum(began[:4])  # of this process and its children
     return {"pair": " to ".join(pair), **errors_of(folder, pair, index), "failed": failed, "cpu": spent}
 
 
 def draw_worst(rows: Sequence[dict[str, Any]], path: Path, data: Path, matcher: Matcher) -> None:
-    """The worst pair of each class, matched again, in one picture: the same colors where the map says the same place."""
+    """Match the worst pair of each class again, and draw all in one picture; corresponding points share a color."""
     drawn = []
     with TemporaryDirectory() as folder:
         for row in runner.track(rows, "pictures"):
@@ -240,25 +260,30 @@ def draw_worst(rows: Sequence[dict[str, Any]], path: Path, data: Path, matcher: 
             result = matcher.match(source, target)
             names = f"{row['class']} {row['worst']}", f"{row['worst_error']:.1f}, {result.map.verdict}"
             shown = compose_match(source, target, result.map, result.rotations).named(names)
-            shown.render(Path(folder) / "pair.png", Look(size=_SIZE))
+            shown.render(Path(folder) / "pair.png", Look(size=_PAIR_SIZE))
             with Image.open(Path(folder) / "pair.png") as image:
                 drawn.append(image.convert("RGB"))
-    sheet = Image.new("RGB", (_ACROSS * _SIZE[0], -(-len(drawn) // _ACROSS) * _SIZE[1]), "white")
+    sheet = Image.new(
+        "RGB", (_PAIRS_PER_ROW * _PAIR_SIZE[0], -(-len(drawn) // _PAIRS_PER_ROW) * _PAIR_SIZE[1]), "white"
+    )
     for number, each in enumerate(drawn):
-        sheet.paste(each, (number % _ACROSS * _SIZE[0], number // _ACROSS * _SIZE[1]))
+        sheet.paste(each, (number % _PAIRS_PER_ROW * _PAIR_SIZE[0], number // _PAIRS_PER_ROW * _PAIR_SIZE[1]))
     sheet.save(path)
 
 
-_Found = Mapping[str, Sequence[dict[str, Any]]]  # pairs of each class
+_Found = Mapping[str, Sequence[dict[str, Any]]]  # measured pairs by class
 
 
-def _all(found: _Found) -> list[dict[str, Any]]:
+def _all_rows(found: _Found) -> list[dict[str, Any]]:
     return [row for some in found.values() for row in some]
 
 
 def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.01) -> DirectCalibration:
-    """By logistic regression, with a little ridge, of maps without a model that are right and wrong."""
-    right = np.array([each["error"] < OFF for each in found])
+    """Fit the calibration by logistic regression on right and wrong maps made without a model.
+
+    ``most`` caps the leads, and ``ridge`` weighs the L2 penalty on the weights.
+    """
+    right = np.array([each["error"] < MAX_ERROR for each in found])
     values = np.array([[-each["energy"], min([most, *each["leads"]])] for each in found])
     deviation = values.std(0) + 1e-9
 
@@ -274,14 +299,14 @@ def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, rid
 
 
 def held_out(found: _Found) -> dict[str, Any]:
-    """How verdicts of each class come out by the weights that the other classes give."""
+    """Count verdicts by leave-one-class-out cross-validation: each class is judged by weights fitted to the others."""
     counts = {"pairs": 0, "right": 0, "good": 0, "good_over": 0, "right_not_poor": 0}
     for name, own in found.items():
         others = [row for other, some in found.items() if other != name for row in some]
         calibration = fitted_calibration(others)
         for row in own:
             verdict = judge_direct(row["energy"], row["leads"], calibration, row["turns"])[0]
-            right = row["error"] < OFF
+            right = row["error"] < MAX_ERROR
             counts["pairs"] += 1
             counts["right"] += right
             counts["good"] += verdict == "good"
@@ -291,22 +316,22 @@ def held_out(found: _Found) -> dict[str, Any]:
 
 
 def _summary(errors: Float[Floats, " N"]) -> dict[str, Any]:
-    mean, median, under = float(errors.mean()), float(np.median(errors)), float((errors < OFF).mean())
+    mean, median, under = float(errors.mean()), float(np.median(errors)), float((errors < MAX_ERROR).mean())
     return {"pairs": len(errors), "mean": mean, "median": median, "under": under}
 
 
 def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The row of a class."""
+    """Return the table row of a class."""
     errors = np.array([each["error"] for each in found])
     good = np.array([each["verdict"] == "good" for each in found])
-    far_off = errors > FAR_OFF
+    far_off = errors > LARGE_ERROR
     told = far_off & np.array([each["ambiguous"] or each["verdict"] == "poor" for each in found])
     worst = int(errors.argmax())
     return {
         "class": name,
         **_summary(errors),
         "good": int(good.sum()),
-        "good_over": int((good & (errors > OFF)).sum()),
+        "good_over": int((good & (errors > MAX_ERROR)).sum()),
         "far_off": int(far_off.sum()),
         "told": int(told.sum()),
         "worst": found[worst]["pair"],
@@ -316,26 +341,29 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _with_calibrations(report: runner.Report, found: _Found) -> runner.Report:
-    """The weights of both verdicts, and how they do on classes that did not give them."""
+    """Add to a report the fitted weights of one-way and two-way matches, and their leave-one-class-out counts."""
     doubtful = {name: [row for row in some if row["one_way"]] for name, some in found.items()}
     one_way = {name: [row["one_way"] or row for row in some] for name, some in found.items()}
     fits = {"one way": one_way, "both ways, where one way leaves doubt": doubtful}
     rows = [{"maps": which, **held_out(each)} for which, each in fits.items()]
-    table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT)
+    table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT_COLUMNS)
     return replace(
         report,
         record={**report.record, "held out": rows},
         tables=[*report.tables, table],
-        notes=[*report.notes, *(f"{which}: {fitted_calibration(_all(each))}" for which, each in fits.items())],
+        notes=[*report.notes, *(f"{which}: {fitted_calibration(_all_rows(each))}" for which, each in fits.items())],
     )
 
 
-def _beside(
+def _compare_methods(
     found: _Found, methods: str, earlier: Path | None, limit: int, data: Path, work: Path | None, seed: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """A row for each of some other methods on some pairs of each class, and for this one; and which could not run."""
+    """Compare with other methods on ``limit`` pairs of each class.
+
+    Return a row for each method, this one first, and notes on the methods that could not run.
+    """
     some = {name: runner.evenly_spread(rows, limit) for name, rows in found.items()}
-    rows, missing = [{"method": "ours", "failed": 0, **_beside_row(_all(some))}], []
+    rows, missing = [{"method": "ours", "failed": 0, **_comparison_row(_all_rows(some))}], []
     others = {name: METHODS[name](Choices(seed=seed))[0] for name in runner.split_names(methods, METHODS, "method")}
     if earlier is not None:
         label = f"fit --model none of {runner.commit(earlier)}"
@@ -353,32 +381,32 @@ def _beside(
                 asked = {"method": name, "seed": seed}
                 measured.append(runner.cached_in(work, f"{kind}-{first}-{second}-{name}", asked, call))
         failed = sum(row["failed"] for row in measured)
-        rows.append({"method": baseline.label, "failed": failed, **_beside_row(measured)})
+        rows.append({"method": baseline.label, "failed": failed, **_comparison_row(measured)})
     return rows, missing
 
 
-def _beside_row(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _comparison_row(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     cpu = float(np.mean([row["cpu"] for row in rows]))
     return {**_summary(np.array([row["error"] for row in rows])), "cpu": cpu}
 
 
 @runner.command
 def main(
-    classes: Annotated[str, Option(help="names, with commas between them; or all")] = "all",
+    classes: Annotated[str, Option(help="comma-separated names, or all")] = "all",
     limit_pairs: runner.LimitPairs = None,
     model: runner.Model = "none",
     seed: runner.Seed = 0,
     data: runner.Data = runner.DATA,
     work: runner.Work = None,
-    fit: Annotated[bool, Option("--fit", help="also find the weights of verdicts")] = False,
-    beside: Annotated[str, Option(help="methods of `bench.baselines` to measure too, with commas between them")] = "",
+    fit: Annotated[bool, Option("--fit", help="also fit the weights of verdicts")] = False,
+    beside: Annotated[str, Option(help="methods of `bench.baselines` to measure too, comma-separated")] = "",
     earlier: Annotated[
         Path | None, Option(help="a checkout of an earlier version, to measure its `fit --model none`")
     ] = None,
-    limit_beside: Annotated[int, Option(min=1, help="pairs of each class that they are measured on")] = 12,
+    limit_beside: Annotated[int, Option(min=1, help="pairs of each class to measure these methods on")] = 12,
     draw: Annotated[Path | None, Option(help="draw the worst pair of each class into this PNG")] = None,
 ) -> runner.Report:
-    names = CLASSES if classes == "all" else runner.split_names(classes, (*CLASSES, *TURNING), "class")
+    names = CLASSES if classes == "all" else runner.split_names(classes, (*CLASSES, *ROTATING_CLASSES), "class")
     found: dict[str, list[dict[str, Any]]] = {}
     asked = {"model": model, "seed": seed}
     for name in names:
@@ -388,7 +416,7 @@ def main(
         for pair in runner.track(pairs, name):
             row = runner.cached_in(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
             found[name].append(judged(row))
-    everything = _all(found)
+    everything = _all_rows(found)
     rows = [*(row_of(name, some) for name, some in found.items()), row_of("all", everything)]
     if any(each["error"] != each["as_marked"] for each in everything):
         marked = [{**each, "error": each["as_marked"]} for each in everything]
@@ -397,9 +425,11 @@ def main(
     record: dict[str, Any] = {"rows": rows, "pairs": everything}
     notes = list[str]()
     if beside or earlier is not None:
-        record["beside"], notes = _beside(found, beside, earlier, limit_beside, data, work, seed)
+        record["beside"], notes = _compare_methods(found, beside, earlier, limit_beside, data, work, seed)
         tables.append(
-            runner.table(f"Beside other methods, {limit_beside} pairs of each class", record["beside"], _BESIDE)
+            runner.table(
+                f"Beside other methods, {limit_beside} pairs of each class", record["beside"], _COMPARISON_COLUMNS
+            )
         )
     if draw is not None:
         draw_worst(rows[: len(names)], draw, data, Matcher(model, FitConfig(seed=seed)))

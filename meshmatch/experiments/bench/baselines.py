@@ -1,20 +1,20 @@
-"""Other methods on the same pairs with the same metric.
+"""Other methods on the same pairs, measured by the same metric.
 
-Each method fits and maps the pairs of `experiments.bench`, and is measured as there: no pair is left out, one that fails
-counts as the map of everything to vertex 0 and is listed as failed. A method whose package is not installed, or whose
-model is not given, is skipped, and the output says so.
+Each method fits and maps the pairs of `experiments.bench` and is measured as there: a pair that fails counts as the map of
+everything to vertex 0 and is listed as failed. A method whose package is not installed, or whose model is not given, is
+skipped, and the output says so.
 
 - rigid: scaled by area, all orientations tried, nearest vertex.
 - zoomout: pyfmaps, HKS and WKS, ZoomOut from 30 to 120 eigenfunctions; meshes thinned to 10,000 triangles.
 - nricp: trimesh's non-rigid ICP, source onto target from the rigid alignment; the source thinned to 5,000 triangles.
 - meshmonk: viscoelastic registration, source onto target from the rigid alignment; both thinned to 20,000 triangles.
-- coded: 3D-CODED (--coded), its code searched by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
+- coded: 3D-CODED (--coded), latent codes optimized by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
   --volume 0 --arap 0 --blend 0`` trains one.
-- ours: this project, refined and not.
+- ours: this project, with refinement and without.
 
-zoomout, nricp and meshmonk need pip install 'meshmatch[bench]'. Each result, a method on a set, is one JSON file in the
-output folder; a second run measures only what is not there. The table says how many pairs were measured, and how long
-learned methods were trained.
+zoomout, nricp and meshmonk need pip install 'meshmatch[bench]'. The result of a method on a set is one JSON file in the
+output folder; a second run measures only missing results. The table gives the number of measured pairs and the training time
+of learned methods.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ COLUMNS = {
 class Baseline:
     """One row of the comparison."""
 
-    name: str  # of its files
-    label: str  # for people
-    method: Method | None  # None where it cannot run
+    name: str  # used in file names
+    label: str  # shown in tables
+    method: Method | None  # None if it cannot run
     missing: str = ""  # why it cannot run
-    minutes: float | None = None  # how long it was trained; None for a method that learns nothing
-    model: str = ""  # tells its weights from others
+    minutes: float | None = None  # training time; None for a method without training
+    model: str = ""  # hash of the model's weights
 
 
 @dataclass(frozen=True)
 class Choices:
-    """The words of the command that methods ask for."""
+    """Command-line choices that methods depend on."""
 
     model: str = "human"
     coded: str | None = None
@@ -68,8 +68,8 @@ class Choices:
     threads: int = 1
 
 
-def _plain(choices: Choices, name: str, label: str, method: Registration | ZoomOut, package: str) -> list[Baseline]:
-    """A method that learns nothing; it cannot run without its package, if it has one."""
+def _untrained(choices: Choices, name: str, label: str, method: Registration | ZoomOut, package: str) -> list[Baseline]:
+    """Return the row of a method without training; it cannot run if its ``package`` is missing."""
     if package and find_spec(package) is None:
         return [Baseline(name, label, None, f"{package} is not installed: pip install 'meshmatch[bench]'")]
     return [Baseline(name, label, replace(method, seed=choices.seed))]
@@ -91,7 +91,7 @@ def _ours(choices: Choices) -> list[Baseline]:
     return [Baseline(*row, "", card.training_minutes, card.weights_sha256) for row in rows]
 
 
-_PLAIN: dict[str, tuple[str, Registration | ZoomOut, str]] = {
+_UNTRAINED: dict[str, tuple[str, Registration | ZoomOut, str]] = {
     "rigid": ("rigid, nearest", Registration("rigid"), ""),
     "zoomout": ("ZoomOut (pyfmaps)", ZoomOut(), "pyFM"),
     "nricp": ("nricp (trimesh)", Registration("nricp", 5000), "trimesh"),
@@ -99,22 +99,22 @@ _PLAIN: dict[str, tuple[str, Registration | ZoomOut, str]] = {
 }
 METHODS: dict[str, Callable[[Choices], list[Baseline]]] = {
     **{
-        name: partial(_plain, name=name, label=label, method=method, package=package)
-        for name, (label, method, package) in _PLAIN.items()
+        name: partial(_untrained, name=name, label=label, method=method, package=package)
+        for name, (label, method, package) in _UNTRAINED.items()
     },
     "coded": _coded,
     "ours": _ours,
 }
-"""The rows of each method that can be asked for. `ModelError` or `TemplateError` for a model that cannot be read."""
+"""By method name, a function that returns its rows; `ModelError` or `TemplateError` if its model cannot be read."""
 
 
 def measured(row: Baseline, bench: BenchSet, folder: Path, limit: int | None, **how: Any) -> dict[str, Any]:
-    """One result: read from the folder, or measured and written there. ``how`` is that of `run_set`.
+    """Return one result, read from the folder or measured and written there. ``how`` is passed on to `run_set`.
 
     Raises
     ------
     OptionError
-        The folder holds this result of other choices.
+        The folder contains this result for other choices.
     InputError
         The file in the folder is damaged.
     """
@@ -146,7 +146,7 @@ def main(
     output: Annotated[Path, Option(help="folder of the results")] = Path("out/baselines"),
     model: runner.Model = "human",
     coded_model: Annotated[str | None, Option("--coded", help="a trained model of 3D-CODED")] = None,
-    coded_steps: Annotated[int, Option(min=1, help="of its search over codes")] = 2000,
+    coded_steps: Annotated[int, Option(min=1, help="steps of its optimization of codes")] = 2000,
     seed: runner.Seed = 0,
     jobs: runner.Jobs = 1,
     threads: runner.Threads = 1,

@@ -1,8 +1,8 @@
-"""A beating heart, tracked: a heart of the bench that contracts, twists and sways, each frame in triangles of its own.
+"""Tracking a beating heart: a heart of the benchmark contracts, twists and sways, and each frame is triangulated differently.
 
-The motion is a function of the place, so that the path of every point is known. The points are the template's vertices where
-they lie on the first frame. The second difference of a path is what a strain curve would show as noise: that of the truth is
-the aim. Lengths are in millimetres.
+The motion is an analytic function of position, so that the path of every point is known. The tracked points are the
+template's vertices as fitted to the first frame. The second difference of a path is what a strain curve would show as noise;
+the ideal is the second difference of the true path. Lengths are in millimeters.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
 SHRINK, TWIST, SHORTEN, SWAY = 0.22, 25.0, 0.12, 6.0
-"""At most: how much the walls contract, degrees between the ends, how much it shortens, and millimetres to the side."""
+"""Maximum contraction of the walls, twist in degrees, shortening along the axis, and sway in millimeters."""
 COLUMNS = {
     "frames": "way", "mean": "mean:.2f", "95 %": "high:.2f", "second difference": "second:.3f", "of the truth": "times:.2f",
     "area strain": "strain:.3f",
@@ -35,7 +35,7 @@ COLUMNS = {
 
 
 def beating(verts: Float[Floats, "V 3"], phase: float) -> Float[Floats, "V 3"]:
-    """Where points of a heart are at a phase of its beat, in radians."""
+    """Return the points of a heart at a phase of its beat, in radians."""
     center = verts.mean(axis=0)
     axes = np.linalg.svd(verts - center, full_matrices=False)[2]
     along, left, front = (
@@ -57,7 +57,7 @@ def beating(verts: Float[Floats, "V 3"], phase: float) -> Float[Floats, "V 3"]:
 
 
 def write_frames(folder: Path, heart: Shape, count: int, seed: int) -> Float[Floats, "T V 3"]:
-    """The frames of one beat, ``frame1.ply`` to ``frameT.ply``; where the heart's own vertices are."""
+    """Write the frames of one beat, ``frame1.ply`` to ``frameT.ply``; return the heart's vertices at each frame."""
     make_folder(folder)
     rng = np.random.default_rng(seed)
     true = np.stack([beating(heart.verts, 2 * np.pi * k / count) for k in range(count)])
@@ -70,7 +70,7 @@ def write_frames(folder: Path, heart: Shape, count: int, seed: int) -> Float[Flo
 
 
 def paths_of(points: Float[Floats, "N 3"], heart: Shape, true: Float[Floats, "T V 3"]) -> Float[Floats, "T N 3"]:
-    """The true paths of points on the first frame."""
+    """Return the true paths of points on the first frame."""
     unit = float(np.sqrt(heart.area))
     foot = Surface(true[0] / unit, heart.faces).query(points / unit)
     return np.stack([interpolate(verts, heart.faces[foot.face], foot.barycentric) for verts in true])
@@ -79,7 +79,7 @@ def paths_of(points: Float[Floats, "N 3"], heart: Shape, true: Float[Floats, "T 
 def row(
     way: str, found: Float[Floats, "T N 3"], true: Float[Floats, "T N 3"], faces: Int[Ints, "F 3"]
 ) -> dict[str, Any]:
-    """How far tracked points are from their true paths, and how rough their own are."""
+    """Return a table row: distances of tracked points from their true paths, roughness of the paths, and strain errors."""
     off = np.linalg.norm(found - true, axis=2)[1:]
     rough, aim = (
         float(np.linalg.norm(np.roll(each, 1, 0) - 2 * each + np.roll(each, -1, 0), axis=2).mean())
@@ -93,7 +93,7 @@ def row(
 
 
 def tracked(fits: Path, work: Path, way: str) -> tuple[Floats, Ints]:
-    """The template on every frame, smoothed or not."""
+    """Return the template's vertices on every frame, smoothed as ``way`` says, and its faces."""
     with tempfile.TemporaryDirectory(dir=work) as folder:
         out = Path(folder, "points")
         Collection(fits).export(out, suffix=".npz", smooth=way == "--smooth", cycle=way == "--cycle")
@@ -101,15 +101,15 @@ def tracked(fits: Path, work: Path, way: str) -> tuple[Floats, Ints]:
             return arrays["points"], arrays["faces"]
 
 
-def _cpu() -> float:
-    """Seconds of CPU, those of processes that have ended with them."""
+def _cpu_seconds() -> float:
+    """CPU seconds of this process and of its children that have ended."""
     return sum(os.times()[:4])
 
 
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
-    heart: Annotated[str, Option(help="of the bench")] = "heart01",
+    heart: Annotated[str, Option(help="a heart of the benchmark")] = "heart01",
     frames: Annotated[int, Option(min=5)] = 20,
     work: runner.Work = None,
     threads: runner.Threads = 1,
@@ -119,14 +119,14 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
         true = write_frames(place / "frames", shape, frames, seed)
-        began = _cpu()
+        began = _cpu_seconds()
         Collection(place / "fits", workers=1).fit(place / "frames", model="none", sequence=True)
-        cpu = _cpu() - began
+        cpu = _cpu_seconds() - began
         rows = []
         for way in ("as fitted", "--smooth", "--cycle"):
             points, faces = tracked(place / "fits", place, way)
             rows.append(row(way, points, paths_of(points[0], shape, true), faces))
-    note = f"{frames} frames fitted in {cpu:.0f} CPU s (less where they were there)"
+    note = f"{frames} frames fitted in {cpu:.0f} CPU s (less where fits were reused)"
     return runner.Report(
         {"rows": rows, "cpu": round(cpu, 1)}, [runner.table("A beating heart, tracked", rows, COLUMNS)], [note]
     )

@@ -1,13 +1,14 @@
-"""How honest verdicts are on people as nobody drew them for training, in other poses, clothes and cuts, by the thousand.
+"""Reliability of verdicts on thousands of generated people outside the training distribution of the human model.
 
-Every body is a function of the seed and its number alone: other people than the training's, in poses beyond its (squatting,
-cross-legged, curled up, handstands, folded forward, hugging the knees, arms crossed or behind the back, any joint anywhere),
-naked, clothed, in skirts, or of other proportions, in other triangles, now and then noisy, with holes, without a limb, or
-only a half. The human model is fitted to each as `match` does it. The error is the mean distance between the fitted
-template's vertices and where they belong, over those that the shape shows, in centimetres of a person of 1.9 m2.
+Every body is a function of the seed and its number alone: identities that training did not use, in poses beyond those of
+training (squatting, cross-legged, curled up, handstands, folded forward, hugging the knees, arms crossed or behind the
+back, random joint angles), naked, clothed, in skirts, or with other proportions. Half of them are remeshed, and some are
+noisy, have holes, lack a limb, or are only one half. The human model is fitted to each as `match` does it. The error is the
+mean distance between the fitted template's vertices and their true positions, over those that are on the shape, in
+centimeters for a person of 1.9 m2.
 
-Each body is a line of ``bodies.jsonl``, and its fit a file beside it: a run that was stopped goes on with what is missing,
-and with ``--known`` where there are only its results.
+Each body is a line of ``bodies.jsonl``, and its fit is a file in the same folder: a stopped run resumes with what is
+missing. ``--known`` resumes from saved results alone.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ from meshmatch.templates.template import Template, read_template
 
 BANDS = (5.0, 8.0, 15.0, 30.0)
 _LOST_CM = 15.0
-_OFF_CM = 8.0
+_WRONG_CM = 8.0
 _POSE_COLUMNS = {
     "pose": "pose",
     "bodies": "bodies:d",
@@ -61,11 +62,17 @@ _POSE_COLUMNS = {
     "over 8 cm": "off:.0%",
 }
 _POSE_COLUMNS |= {"of these not poor": "not_poor:d"}
-_PEOPLE, _OTHER_PEOPLE = 64, 5300
-_TRIES = 6  # of which the pose is taken in which the body runs into itself least
-_STYLES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, free, stylised, built of parts
-# Angles of `Limbs` in the order of its fields, of both arms (elevation, azimuth, twist, elbow, pronation) and of both legs
-# (hip flexion, abduction, twist, knee, ankle), and of the spine (flexion, side, twist); degrees.
+_N_IDENTITIES, _FIRST_IDENTITY_SEED = 64, 5300
+_TRIES = 6  # poses drawn for each body; the one with the least self-penetration is used
+_STYLE_PROBABILITIES = (
+    0.78,
+    0.12,
+    0.06,
+    0.04,
+    0.0,
+)  # probabilities of plain, child, stretched, stylized, built of parts
+# Mean angles in degrees, in the order of the fields of `Limbs`: alternatives for an arm (elevation, azimuth, twist, elbow,
+# pronation), alternatives for a leg (hip flexion, abduction, twist, knee, ankle), and the spine (flexion, side, twist).
 _HANG, _AHEAD, _UP = (12, 10, 0, 8, 10), (85, 88, 0, 15, 10), (172, 40, -60, 8, 0)
 _CROSSED, _FACE, _BEHIND, _KNEES = (
     (38, 82, 62, 98, 40),
@@ -74,36 +81,39 @@ _CROSSED, _FACE, _BEHIND, _KNEES = (
     (50, 85, 10, 20, 60),
 )
 _HUG, _HIPS = (62, 88, 40, 70, 30), (48, -10, 55, 95, 20)
-_STRAIGHT = (2, 6, 2, 4, 0)
+_STRAIGHT_LEG = (2, 6, 2, 4, 0)
 POSES: dict[str, tuple[tuple[Sequence[float], ...], tuple[Sequence[float], ...], tuple[float, float, float]]] = {
     "squat": ((_AHEAD, _HANG, _KNEES, _FACE), ((125, 18, 5, 145, -25), (120, 35, 20, 140, -20)), (30, 0, 0)),
     "kneel": ((_HANG, _UP, _CROSSED, _BEHIND), ((5, 10, 5, 100, 40), (90, 12, 5, 150, 45)), (5, 0, 0)),
     "cross-legged": ((_KNEES, _HANG, _FACE, _CROSSED), ((85, 45, 50, 120, 0), (95, 35, 60, 135, 10)), (20, 0, 0)),
     "sit": ((_KNEES, _CROSSED, _HANG), ((90, 4, 0, 90, 0), (88, -12, 0, 70, 0), (95, 8, 0, 10, 0)), (10, 0, 0)),
     "curled up": ((_HUG, _CROSSED, _FACE), ((132, 5, 0, 140, 20), (120, 0, 0, 125, 10)), (50, 0, 0)),
-    "lie": ((_HANG, _UP, _BEHIND), (_STRAIGHT, (0, 2, 0, 2, 35)), (0, 0, 0)),
+    "lie": ((_HANG, _UP, _BEHIND), (_STRAIGHT_LEG, (0, 2, 0, 2, 35)), (0, 0, 0)),
     "hands on knees": ((_KNEES,), ((55, 12, 5, 35, -10),), (40, 0, 0)),
-    "hands on face": ((_FACE,), (_STRAIGHT, (60, 5, 0, 90, 0)), (15, 0, 0)),
-    "handstand": ((_UP,), (_STRAIGHT, (35, 50, 10, 70, 30), (-20, 10, 0, 60, 30)), (-15, 0, 0)),
+    "hands on face": ((_FACE,), (_STRAIGHT_LEG, (60, 5, 0, 90, 0)), (15, 0, 0)),
+    "handstand": ((_UP,), (_STRAIGHT_LEG, (35, 50, 10, 70, 30), (-20, 10, 0, 60, 30)), (-15, 0, 0)),
     "folded forward": ((_AHEAD, (130, 85, 0, 5, 0), _HUG), ((115, 5, 0, 5, 0), (100, 25, 0, 3, 0)), (65, 0, 0)),
-    "arms crossed": ((_CROSSED,), (_STRAIGHT, (3, -10, 5, 5, 0)), (5, 0, 0)),
-    "arms behind": ((_BEHIND, _HIPS), (_STRAIGHT, (-15, 5, 0, 20, 0)), (-10, 0, 0)),
+    "arms crossed": ((_CROSSED,), (_STRAIGHT_LEG, (3, -10, 5, 5, 0)), (5, 0, 0)),
+    "arms behind": ((_BEHIND, _HIPS), (_STRAIGHT_LEG, (-15, 5, 0, 20, 0)), (-10, 0, 0)),
     "bridge": ((_UP,), ((-30, 15, 0, 85, 10),), (-75, 0, 0)),
     "splits": (
         (_UP, _HANG, (90, 0, 0, 5, 0)),
         ((95, 0, 0, 4, 30), (-55, 0, 0, 10, 30), (20, 80, 0, 4, 20)),
         (10, 0, 0),
     ),
-    "twisted": ((_HIPS, _AHEAD, _HUG), (_STRAIGHT, (100, 10, 0, 95, 0)), (15, 25, 55)),
-    "anywhere": ((_HANG,), (_STRAIGHT,), (0, 0, 0)),
+    "twisted": ((_HIPS, _AHEAD, _HUG), (_STRAIGHT_LEG, (100, 10, 0, 95, 0)), (15, 25, 55)),
+    "anywhere": ((_HANG,), (_STRAIGHT_LEG,), (0, 0, 0)),
 }
-_LOW, _HIGH = (0, -70, -120, 0, -90, -45, -25, -40, 0, -40, -0.3), (178, 135, 90, 150, 95, 140, 85, 60, 155, 45, 1.0)
-_OWN_LEGS = ("splits", "anywhere", "kneel", "handstand", "cross-legged")  # left and right may differ
+_MIN_ANGLES, _MAX_ANGLES = (
+    (0, -70, -120, 0, -90, -45, -25, -40, 0, -40, -0.3),
+    (178, 135, 90, 150, 95, 140, 85, 60, 155, 45, 1.0),
+)
+_ASYMMETRIC_POSES = ("splits", "anywhere", "kneel", "handstand", "cross-legged")  # left and right may differ
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A generated shape, and where the template's vertices belong on it (``places``), of which it ``has`` some."""
+    """A generated shape, the true positions of the template's vertices (``places``), and which of these the shape ``has``."""
 
     shape: Shape
     places: Float[Floats, "T 3"]
@@ -113,27 +123,27 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class People:
-    """Draws bodies of one seed."""
+    """Generator of the bodies of one seed."""
 
     template: Template
     seed: int
 
     @cached_property
     def figure(self) -> Figure:
-        return Figure.of(template_rig(self.template, _PEOPLE, _OTHER_PEOPLE + self.seed))
+        return Figure.of(template_rig(self.template, _N_IDENTITIES, _FIRST_IDENTITY_SEED + self.seed))
 
     def draw(self, number: int) -> Body:
-        """A body, turned anywhere, in any unit."""
+        """Draw a body in a random orientation and a random unit of length."""
         rng = np.random.default_rng([self.seed, number])
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         pose = list(POSES)[int(rng.integers(len(POSES)))]
-        verts, worn = self._posed(pose, rng, generator)
+        verts, worn = self._draw_verts(pose, rng, generator)
         whole, tris = Shape(verts, np.asarray(self.template.shape.faces)), "template's"
         shape = whole
         if rng.random() < 0.5:
             tris, fine = "others", trimesh.Trimesh(verts, whole.faces, process=False).subdivide()
             shape = decimate(Shape(fine.vertices, fine.faces), int(rng.integers(4_000, 16_000)))
-        cut, kept = self._cut(verts, rng)
+        cut, kept = self._draw_cut(verts, rng)
         near = cKDTree(verts).query(shape.verts)[1]
         shape, near = faces_kept(shape, near, np.asarray(kept(shape.verts, near)[shape.faces].all(1)))
         noise = rng.uniform(0.002, 0.012) if rng.random() < 0.15 else 0.0
@@ -143,11 +153,11 @@ class People:
         words = {"pose": pose, "worn": worn, "cut": cut, "triangles": tris, "noise": f"{1000 * noise:.0f} mm"}
         return Body(moved, unit * verts @ turn.T, kept(verts, np.arange(len(verts))), words)
 
-    def _posed(self, pose: str, rng: np.random.Generator, generator: torch.Generator) -> tuple[Floats, str]:
-        """Vertices in metres, and what is worn or odd about them."""
+    def _draw_verts(self, pose: str, rng: np.random.Generator, generator: torch.Generator) -> tuple[Floats, str]:
+        """Draw vertices in meters; return them with a description of style and clothing."""
         figure, rig = self.figure, self.figure.rig
         rest, heads = draw_identities(rig, 1, generator)
-        style = draw_style(1, generator, _STYLES)
+        style = draw_style(1, generator, _STYLE_PROBABILITIES)
         worn = str(rng.choice(["naked", "clothed", "skirt"], p=[0.4, 0.4, 0.2]))
         kind = ("", "child, ", "stretched, ", "stylised, ")[int(style.kind)]
         if kind:
@@ -157,7 +167,7 @@ class People:
         if worn != "naked":
             rest = add_clothes(figure, rest, heads, generator)
         many = heads.repeat(_TRIES, 1, 1)
-        world, offset = forward_kinematics(rig, many, self._angles(pose, many, rng, generator))
+        world, offset = forward_kinematics(rig, many, self._draw_rotations(pose, many, rng, generator))
         best = int(penetration(rig, many, world, offset).argmin())
         world, offset = world[best : best + 1], offset[best : best + 1]
         verts = skin(rig, rest, world, offset)
@@ -166,13 +176,13 @@ class People:
             verts = add_skirts(figure, verts, heads, joints, generator)
         return verts[0].double().numpy(), kind + worn
 
-    def _angles(
+    def _draw_rotations(
         self, pose: str, heads: torch.Tensor, rng: np.random.Generator, generator: torch.Generator
     ) -> torch.Tensor:
-        """Rotations of all joints, one for each of the tries."""
+        """Draw the rotations of all joints, one set for each of the tries."""
         B, rig, draw = len(heads), self.figure.rig, Draw(len(heads), generator)
         arms, legs, spine = POSES[pose]
-        same_arms, same_legs = rng.random() < 0.7, pose not in _OWN_LEGS or rng.random() < 0.5
+        same_arms, same_legs = rng.random() < 0.7, pose not in _ASYMMETRIC_POSES or rng.random() < 0.5
         picks = [(arms[rng.integers(len(arms))], legs[rng.integers(len(legs))]) for _ in range(2)]
         sides = []
         for side in (0, 1):
@@ -181,7 +191,7 @@ class People:
             deviation = np.r_[np.full(10, 7.0), 0.08]
             columns = [draw.normal(a, d) for a, d in zip(middle, deviation, strict=True)]
             if pose == "anywhere":
-                columns = [draw.uniform(a, b) for a, b in zip(_LOW, _HIGH, strict=True)]
+                columns = [draw.uniform(a, b) for a, b in zip(_MIN_ANGLES, _MAX_ANGLES, strict=True)]
             names = [field.name for field in fields(Limbs)]
             sides.append(Limbs(**dict(zip(names, columns, strict=True))))
         vectors = torch.zeros(B, heads.shape[1], 3)
@@ -197,8 +207,11 @@ class People:
             rotations[:, index] = rotation
         return rotations
 
-    def _cut(self, verts: Floats, rng: np.random.Generator) -> tuple[str, Callable[[Floats, Ints], Bools]]:
-        """What is cut off, and which points are kept, by their places and the template's vertices that they are at."""
+    def _draw_cut(self, verts: Floats, rng: np.random.Generator) -> tuple[str, Callable[[Floats, Ints], Bools]]:
+        """Draw what is cut off.
+
+        Return its name, and a function that selects the points to keep from positions and nearest template vertices.
+        """
         which = str(rng.choice(["none", "half", "limb off", "limb alone", "holes"], p=[0.85, 0.05, 0.02, 0.01, 0.07]))
         names, labels = self.template.label_names, np.asarray(self.template.labels)
         if which == "half":
@@ -217,7 +230,7 @@ class People:
 
 
 def measured(body: Body, fit: Fit, template: Template) -> dict[str, Any]:
-    """The errors of a fit, and what is said of it."""
+    """Return the errors of a fit, its verdict and its features."""
     unit = CM_PER_UNIT / np.sqrt(Shape(body.places, template.shape.faces).area)
     cm = unit * np.linalg.norm(fit.points_in_file - body.places, axis=1)
     opposite = cKDTree(template.shape.verts).query(template.shape.verts * [-1, 1, 1])[1]
@@ -232,13 +245,13 @@ def measured(body: Body, fit: Fit, template: Template) -> dict[str, Any]:
 
 
 def band_of(error: float) -> str:
-    """Between which limits an error lies."""
+    """Return the name of the band that contains an error in centimeters."""
     low = max((limit for limit in BANDS if error >= limit), default=0.0)
     return f"over {low:g} cm" if low == BANDS[-1] else f"{low:g} to {BANDS[BANDS.index(low) + 1 if low else 0]:g} cm"
 
 
-def counted(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for every band of error: how many fits of each verdict."""
+def count_by_error(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Count fits by verdict: a row for every band of error."""
     found = []
     for name in [band_of(limit) for limit in (0.0, *BANDS)]:
         some = [row["verdict"] for row in rows if row["verdict"] != REFUSED and band_of(row["error"]) == name]
@@ -246,8 +259,8 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def by_pose(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for every pose: how far the fits are off, and how many of those are not called poor."""
+def summarize_by_pose(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Summarize errors by pose, with the number of fits over 8 cm that are not called poor."""
     found = []
     for pose in POSES:
         some = [
@@ -256,20 +269,20 @@ def by_pose(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         if some:
             errors = np.array([row["error"] for row in some])
             told = np.array([row["verdict"] != "poor" for row in some])
-            off = errors > _OFF_CM
+            off = errors > _WRONG_CM
             row = {"pose": pose, "bodies": len(some), "mean": errors.mean(), "median": np.median(errors)}
             found.append(row | {"off": off.mean(), "not_poor": int((off & told).sum())})
     return found
 
 
 def kept(row: dict[str, Any]) -> str:
-    """A body in few words, as `finished_bodies` reads them."""
+    """Format a body as one line, which `finished_bodies` parses."""
     error = f"{row['error']:.2f}" if "error" in row else ""
     return "; ".join([str(row["seed"]), str(row["number"]), row["pose"], row["cut"], error, row["verdict"]])
 
 
 def finished_bodies(path: Path) -> list[dict[str, Any]]:
-    """The bodies of an earlier run's results."""
+    """Read the bodies from the saved results of an earlier run."""
     found = []
     try:
         for line in read_json(path)["values"]["rows"]:
@@ -284,10 +297,12 @@ def finished_bodies(path: Path) -> list[dict[str, Any]]:
 @runner.command
 def main(
     bodies: Annotated[int, Option(min=1, help="how many")] = 5000,
-    output: Annotated[Path, Option(help="folder of what was measured")] = Path("campaign"),
+    output: Annotated[Path, Option(help="folder of bodies and fits")] = Path("campaign"),
     threads: runner.Threads = 1,
     seed: runner.Seed = 1,
-    seeds: Annotated[int, Option(min=1, help="the bodies are, by turns, of so many seeds from that one on")] = 2,
+    seeds: Annotated[
+        int, Option(min=1, help="number of seeds, from --seed on, that bodies are drawn from by turns")
+    ] = 2,
     known: Annotated[Path | None, Option(help="results of an earlier run: its bodies are not fitted again")] = None,
 ) -> runner.Report:
     make_folder(output / "fits")
@@ -312,7 +327,7 @@ def main(
         rows.append(row)
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(runner.to_json(row)) + "\n")
-    found, poses = counted(rows), by_pose(rows)
+    found, poses = count_by_error(rows), summarize_by_pose(rows)
     refused = sum(row["verdict"] == REFUSED for row in rows)
     columns = {"error": "error"} | {name: f"{name}:d" for name in (*VERDICTS, "all")}
     tables = [

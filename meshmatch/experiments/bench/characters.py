@@ -1,9 +1,10 @@
-"""People in clothes, stylised characters and people who touch themselves, none of them seen in training.
+"""People in clothes, stylized characters and people in self-contact, none of them seen in training.
 
-They are generated, so that the truth is known: the distance along the naked target body below the clothes between the
-matched place and the true one, at every twentieth vertex of the body, in centimetres at 1.9 m2 of skin; and the share of
-vertices whose partner hangs on the same bone. A pair that is more than 8 cm off on average is wrong. Every ordered pair of a
-group counts, matched as `match` does it, from files turned anywhere. Seconds are of CPU: two fits and the map.
+They are generated, so that the true map is known. The error is the geodesic distance, on the naked target body below the
+clothes, between the matched point and the true one, at every twentieth vertex of the body, in centimeters at 1.9 m2 of
+skin. "same bone" is the share of vertices whose partner follows the same bone. A pair with a mean error over 8 cm is wrong.
+Every ordered pair of a group counts, matched as `match` does it, in random orientations. Seconds are CPU time: two fits and
+the map.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.templates.template import read_template
 
 KINDS = {"clothed": PLAIN, "children": CHILD, "stylised": TOON, "built": BUILT}
-CONTACTS = {"touching": False, "fused": True}  # fused where they touch?
+CONTACTS = {"touching": False, "fused": True}  # whether surfaces in contact are fused
 GROUPS = (*KINDS, *CONTACTS)
-_WRONG = 8.0  # centimetres: a pair that is farther off on average
-_EVERY = 20  # vertex of the body is a place where errors are measured
+_WRONG_CM = 8.0  # mean error in centimeters above which a pair is wrong
+_STRIDE = 20  # errors are measured at every 20th vertex of the body
 COLUMNS = {
     "group": "group", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "median": "median_cm:.2f", "worst": "worst_cm:.1f",
     "same bone": "bone:.3f", "lowest": "lowest:.3f", "good / fair / poor": "verdicts:>",
@@ -44,18 +45,18 @@ COLUMNS = {
 
 
 def measured(source: Character, target: Character, found: VertexMap, cache: Path | None) -> dict[str, float]:
-    """Error in centimetres on the body below, and the share of vertices on the same bone."""
-    known = np.arange(0, target.body.V, _EVERY)
-    at = np.flatnonzero(source.places % _EVERY == 0)
-    rows = TruthDistances(target.body, known, cache).of(source.places[at] // _EVERY)
+    """Return the error in centimeters on the naked body, and the share of vertices mapped to the same bone."""
+    known = np.arange(0, target.body.V, _STRIDE)
+    at = np.flatnonzero(source.places % _STRIDE == 0)
+    rows = TruthDistances(target.body, known, cache).of(source.places[at] // _STRIDE)
     off = rows[np.arange(len(at)), target.places[found.index[at]]]
     same = target.bones[found.index] == source.bones
     return {"bone": float(same.mean()), "cm": CM_PER_UNIT * float(off.mean(dtype=np.float64))}
 
 
-def row_of(group: str, cast: Sequence[Character], matcher: Matcher, cache: Path | None) -> dict[str, Any]:
-    """All ordered pairs of a group."""
-    of = {each.shape.name: each for each in cast}
+def row_of(group: str, characters: Sequence[Character], matcher: Matcher, cache: Path | None) -> dict[str, Any]:
+    """Match all ordered pairs of a group and return its table row."""
+    of = {each.shape.name: each for each in characters}
     shapes = {name: each.shape for name, each in of.items()}
     fits, found = matched(matcher, shapes, ordered_pairs(of), group)
     errors = {(a, b): measured(of[a], of[b], each.map, cache) for (a, b), each in found.items()}
@@ -66,7 +67,7 @@ def row_of(group: str, cast: Sequence[Character], matcher: Matcher, cache: Path 
         **{"group": group, "pairs": len(found), "bone": float(np.mean(bone)), "lowest": min(bone)},
         **{"mean_cm": float(np.mean(cm)), "median_cm": float(np.median(cm)), "worst_cm": max(cm)},
         "verdicts": " / ".join(str(verdicts[word]) for word in VERDICTS),
-        "wrong_good": sum(found[pair].verdict == "good" and each["cm"] > _WRONG for pair, each in errors.items()),
+        "wrong_good": sum(found[pair].verdict == "good" and each["cm"] > _WRONG_CM for pair, each in errors.items()),
         **{"seconds": float(np.mean(seconds)), "slowest": max(seconds)},
         "each": [[*pair, each] for pair, each in errors.items()],
         "fits": {name: [fit.verdict, [reason.code for reason in fit.reasons]] for name, fit in fits.items()},
@@ -77,7 +78,7 @@ def row_of(group: str, cast: Sequence[Character], matcher: Matcher, cache: Path 
 def main(
     groups: Annotated[str, Option(help=f"of {', '.join(GROUPS)}")] = ",".join(GROUPS),
     model: runner.Model = "human",
-    count: Annotated[int, Option(min=2, help="generated characters of each group")] = 4,
+    count: Annotated[int, Option(min=2, help="generated characters per group")] = 4,
     cache: runner.Cache = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
@@ -89,9 +90,9 @@ def main(
         else:
             made = people_in_contact(template, count, seed, group, CONTACTS[group])
         turns = Rotation.random(count, random_state=np.random.default_rng([seed, 3])).as_matrix()
-        cast = [
+        characters = [
             replace(each, shape=replace(each.shape, verts=each.shape.verts @ turn.T))
             for each, turn in zip(made, turns, strict=True)
         ]
-        rows.append(row_of(group, cast, matcher, cache))
+        rows.append(row_of(group, characters, matcher, cache))
     return runner.Report({"rows": rows}, [runner.table(f"Characters with {matcher.model.card.name}", rows, COLUMNS)])

@@ -1,10 +1,10 @@
-"""Whole sets as collections: every shape fitted once, all fits agreed, every map looked up; how long it takes, and errors.
+"""Times and errors of whole sets as collections: each shape is fitted once, fits are made to agree, maps are looked up.
 
-The fits are made by one process and by two, each from nothing, and must be the same bit for bit; the ratio of their times
-is what two processes gain. Errors count all pairs, as in `meshmatch.experiments.bench`, where the same maps made pair by
-pair are. The ten four-chamber hearts are fitted without a model (`--model none`). They were decimated independently; where
-two kept a vertex of the same original mesh, about a fifth of each, the truth is known exactly. Their error is Euclidean, for
-walls are thin, and the surface's own distance between two points of a wall may be long; in units of sqrt(area), times 100.
+The fits are made from scratch by one process and by two, and must be bit-identical; the ratio of the times is the speed-up
+by a second process. Errors count all pairs, as in `meshmatch.experiments.bench`, which measures the same maps made pair by
+pair. The ten four-chamber hearts are fitted without a model (`--model none`). They were decimated independently; vertices
+of the same original mesh that both shapes of a pair kept, about a fifth of each, are exact ground truth. Their errors are
+Euclidean, in units of sqrt(area), times 100: the walls are thin, and geodesic distances between their two sides are long.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ HEART = "heart"
 SETS = ("scape", "faust", HEART)
 TRUTH = ".truth.npy"
 Truth = Mapping[str, Int[Ints, "V 2"]]
-"""For each shape and vertex: the vertex of the original mesh, and the chamber."""
+"""For each shape, the vertex of the original mesh and the chamber of each of its vertices."""
 COLUMNS = {"set": "set", "shapes": "shapes:d", "maps": "maps:d", "fits, 1 process": "one_s:.1f"}
 COLUMNS |= {
     "2 processes": "two_s:.1f",
@@ -53,9 +53,9 @@ HEARTS |= {"right chamber": "right_chamber:.1%", "along the normals": "across_x1
 
 
 def heart_errors(shapes: Shapes, truth: Truth, maps: Mapping[Pair, VertexMap]) -> dict[str, Any]:
-    """Errors at the vertices whose partner is known: over pairs, and the share of right chambers.
+    """Compute errors at the vertices whose partner is known, and the share mapped to the right chamber.
 
-    ``across_x100`` is the part of the errors along the target's normals: the rest is sliding along the surface.
+    ``across_x100`` is the component of the errors along the target's normals; the rest is sliding along the surface.
     """
     means, chambers, across = {}, [], []
     for (source, target), found in maps.items():
@@ -75,13 +75,13 @@ def heart_errors(shapes: Shapes, truth: Truth, maps: Mapping[Pair, VertexMap]) -
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The finished fits of a folder."""
+    """Read the finished fits of a folder as bytes, by relative path."""
     fits = folder / "fits"
     return {path.relative_to(fits).as_posix(): path.read_bytes() for path in sorted(fits.rglob("*.safetensors"))}
 
 
 def timed_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float:
-    """Seconds that `meshmatch fit` takes as a whole process, from nothing."""
+    """Run `meshmatch fit` from scratch in a new process and return its seconds; `InputError` if it fails."""
     words = [*map(str, shapes), "-o", str(folder), "--model", model, "--jobs", str(jobs), "--quiet", "--json"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
     began = time.perf_counter()
@@ -93,7 +93,7 @@ def timed_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float
 
 
 def measure(name: str, data: Path, work: Path, limit: int | None, model: str | None = None) -> dict[str, Any]:
-    """One row."""
+    """Fit, agree and map one set, and return its table row."""
     model, details = model or (NO_MODEL if name == HEART else "human"), {}
     if name == HEART:
         shapes, truth = load_folder(data / HEART, TRUTH)
@@ -103,7 +103,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
         paths = [bench.path(each) for each in runner.evenly_spread(list(bench.shapes), limit)]
     one, two = work / f"{name}-1", work / f"{name}-2"
     seconds = {folder: timed_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
-    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # of all processes so far
+    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # maximum over all child processes so far
     collection = Collection(two, 2)
     pairs = list(permutations(collection.names, 2))
     began = time.perf_counter()
@@ -128,7 +128,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
 
 
 def heart_pairs(data: Path, limit: int) -> dict[str, Any]:
-    """The same of pairs that are matched by themselves, without a model."""
+    """Compute the errors of hearts that are matched pair by pair, without a model."""
     shapes, truth = load_folder(data / HEART, TRUTH)
     found = matched_directly(Matcher(NO_MODEL, threads=1), shapes, ordered_pairs(shapes, limit), HEART)
     return {"how": "of pairs", **heart_errors(shapes, truth, {pair: each.map for pair, each in found.items()})}
@@ -140,7 +140,7 @@ def main(
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     model: Annotated[str | None, Option(help="default: human, and none for hearts")] = None,
     limit_shapes: Annotated[int | None, Option(min=2, help="of each set, evenly spread; by default all")] = None,
-    pairs: Annotated[int, Option(min=0, help="of hearts that are also matched by themselves")] = 0,
+    pairs: Annotated[int, Option(min=0, help="pairs of hearts to match one by one as well")] = 0,
     work: Annotated[Path | None, Option(help="keep fits and maps in this new folder")] = None,
 ) -> runner.Report:
     """Fit, agree and map whole sets."""
