@@ -11,7 +11,15 @@ from scipy.spatial.transform import Rotation
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import baselines
 from meshmatch.experiments.bench.baselines import METHODS, Baseline, Choices, main
-from meshmatch.experiments.bench.methods import Method, Registration, ZoomOut, carried, coded, library, placed
+from meshmatch.experiments.bench.methods import (
+    Method,
+    Registration,
+    ZoomOut,
+    coded,
+    interpolate_thin,
+    library,
+    normalize_shape,
+)
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
 from tests.experiments.small_bench import Oracle, build
@@ -70,13 +78,13 @@ def test_a_method_that_needs_triangles_says_so(method: Method) -> None:
 
 
 def test_the_whole_goes_where_the_thin_one_goes() -> None:
-    whole = placed(lump())
+    whole = normalize_shape(lump())
     there = whole.whole.verts * [1, 2, 3] + 4
-    assert np.allclose(carried(whole, there), there)
-    thin = placed(lump(), faces=300)
+    assert np.allclose(interpolate_thin(whole, there), there)
+    thin = normalize_shape(lump(), faces=300)
     assert thin.thin.F < 400
     there = thin.thin.verts @ np.diag([1.0, 2.0, 3.0]) + 4
-    assert np.abs(carried(thin, there) - (thin.whole.verts * [1, 2, 3] + 4)).max() < 0.2
+    assert np.abs(interpolate_thin(thin, there) - (thin.whole.verts * [1, 2, 3] + 4)).max() < 0.2
 
 
 def test_a_librarys_failure_is_a_failed_pair_and_a_bug_is_a_bug() -> None:

@@ -8,13 +8,13 @@ skipped, and the output says so.
 - zoomout: pyfmaps, HKS and WKS, ZoomOut from 30 to 120 eigenfunctions; meshes thinned to 10,000 triangles.
 - nricp: trimesh's non-rigid ICP, source onto target from the rigid alignment; the source thinned to 5,000 triangles.
 - meshmonk: viscoelastic registration, source onto target from the rigid alignment; both thinned to 20,000 triangles.
-- coded: 3D-CODED (--coded), latent codes optimized by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
+- coded: 3D-CODED (--coded), its code optimized by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
   --volume 0 --arap 0 --blend 0`` trains one.
 - ours: this project, with refinement and without.
 
 zoomout, nricp and meshmonk need pip install 'meshmatch[bench]'. The result of a method on a set is one JSON file in the
-output folder; a second run measures only missing results. The table gives the number of measured pairs and the training time
-of learned methods.
+output folder; a second run measures only missing results. The table gives the number of measured pairs and the training
+time of learned methods.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tracking a beating heart: a heart of the benchmark contracts, twists and sways, and each frame is triangulated differently.
+"""Tracking a beating heart: a heart of the benchmark contracts, twists and sways; each frame is remeshed differently.
 
 The motion is an analytic function of position, so that the path of every point is known. The tracked points are the
 template's vertices as fitted to the first frame. The second difference of a path is what a strain curve would show as noise;

@@ -113,7 +113,7 @@ _ASYMMETRIC_POSES = ("splits", "anywhere", "kneel", "handstand", "cross-legged")
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A generated shape, the true positions of the template's vertices (``places``), and which of these the shape ``has``."""
+    """A generated shape, the true positions of the template's vertices (``places``), and which of them it ``has``."""
 
     shape: Shape
     places: Float[Floats, "T 3"]

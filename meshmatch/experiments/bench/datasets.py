@@ -1,8 +1,8 @@
 """Check a folder of evaluation data: one line for each set, and what is wrong with it.
 
-docs/datasets.md says where the sets come from and how they are laid out. Every shape is read; its triangles, and the
-vertices that its truth names, must exist; all shapes of a set must have as many landmarks. Status 1 where a set lacks
-something. A set may have more or other shapes than the published numbers are of, which stand beside.
+docs/datasets.md says where the sets come from and how they are laid out. Every shape is read and must have triangles; the
+vertices named by its ground truth must exist; all shapes of a set must have the same number of landmarks. The exit status
+is 1 if a set is incomplete. A set may have more or other shapes than the published numbers used; "published" is their count.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ COLUMNS |= {"truth": "truth", "pairs": "pairs:d", "found": "state"}
 
 @dataclass(frozen=True)
 class Layout:
-    """How a set lies in its folder.
+    """Layout of the folder of a set.
 
     Parameters
     ----------
-    published : number of shapes that docs/results.md is of
-    suffix : of the file of what is true of each shape; empty where there is none
-    columns : of that file: 1 a vertex for each landmark, 2 a row for each vertex
-    words : what is true, where not every shape's landmarks are counted
+    published : number of shapes used for docs/results.md
+    suffix : suffix of each shape's ground truth file; empty if there is none
+    columns : columns of that file: 1 for a vertex per landmark, 2 for a row per vertex
+    words : description of the ground truth, unless it is the number of landmarks
     """
 
     published: int
@@ -54,17 +54,17 @@ LAYOUTS = {
     **dict.fromkeys(("chair", "table", "plane"), Layout(10, ".keypoints.npy")),
     "animal": Layout(32, ".landmarks.npy"),
 }
-"""Folders of ply files."""
+"""Layouts of the sets that are folders of ply files."""
 TEXTURED = ("Rogue.glb", "Rogue_Hooded.glb", "spot_triangulated.obj")
 
 
 def checked_truth(path: Path, layout: Layout, shape: Shape) -> int:
-    """Number of landmarks of a shape; of rows where each vertex has one.
+    """Check the ground truth of a shape and return its number of rows: one for each landmark, or for each vertex.
 
     Raises
     ------
     InputError
-        The file is not there, is no array of integers of the right shape, or names a vertex that the shape lacks.
+        The file is missing, is not an integer array of the right shape, or names a vertex that does not exist.
     """
     try:
         truth = np.load(path, allow_pickle=False)
@@ -80,7 +80,7 @@ def checked_truth(path: Path, layout: Layout, shape: Shape) -> int:
 
 
 def check_shapes(name: str, layout: Layout, folder: Path) -> dict[str, Any]:
-    """What is in a folder of ply files; "pairs" where the benchmark has a protocol for it."""
+    """Check a folder of ply files and return its table row; "pairs" is None without a protocol for pairs."""
     files = runner.files_in(folder / name, "*.ply")
     shapes = [load_shape(file) for file in runner.track(files, name)]
     if flat := [file.name for file, shape in zip(files, shapes, strict=True) if shape.is_cloud]:
@@ -97,13 +97,13 @@ def check_shapes(name: str, layout: Layout, folder: Path) -> dict[str, Any]:
 
 
 def row_of(shapes: Collection[Shape], truth: str) -> dict[str, Any]:
-    """What some shapes are like."""
+    """Summarize shapes: their number, and the ranges of their vertices and faces."""
     sizes = {"vertices": _range(each.V for each in shapes), "faces": _range(each.F for each in shapes)}
     return {"shapes": len(shapes), **sizes, "truth": truth}
 
 
 def check_textured(folder: Path) -> dict[str, Any]:
-    """The shapes with textures."""
+    """Check the textured shapes and return their table row."""
     paths = [folder / "textured" / name for name in TEXTURED]
     if missing := [path for path in paths if not path.is_file()]:
         raise InputError(f"there is no {missing[0]}")
@@ -120,7 +120,7 @@ CHECKS: dict[str, tuple[int, Callable[[Path], dict[str, Any]]]] = {
     OUTLIERS_FILE: (30, lambda folder: row_of(load_clouds(folder).values(), "row i is row i")),
     "textured": (3, check_textured),
 }
-"""By set: how many shapes the published numbers are of, and what looks at it."""
+"""For each set, the number of shapes used for the published numbers, and the function that checks it."""
 
 
 @runner.command

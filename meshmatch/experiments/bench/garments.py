@@ -1,12 +1,13 @@
-"""Clothes, hair, hats and shoes from person to person, beside their exact refit.
+"""Transfer of clothes, hair, hats and shoes between people, compared with the exact refit.
 
 MakeHuman's clothes (`.mhclo`) bind each vertex to a triangle of its body and an offset, so that the refit on any body of
-that family is exact; in another pose it follows the joints as its triangles do. Bodies are generated: people at rest, as
-they were bound, and in a pose. Each person lends the garments to the next one, whose body is cut into other triangles.
+that family is exact; in another pose a vertex follows the joints as its triangle does. Bodies are generated: people in the
+rest pose, in which garments are bound, and in a random pose. The garments of each person are transferred to the next one,
+whose body is remeshed.
 
-The distance is that of each vertex from its exact place, in centimetres. Under the skin is what lies inside the target and
-not inside the source; the exact refit has such vertices too. ``--exact-map`` carries along the true map instead of a match,
-and so shows what remains without the match's errors.
+The error is the distance of each vertex from its position in the exact refit, in centimeters. "under the skin" counts
+vertices inside the target that are not inside the source; the exact refit has such vertices too. ``--exact-map`` transfers
+by the true map instead of a match, which leaves the errors of the transfer alone.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.garment import carry_garment
 
 Pose = Literal["rest", "posed"]
-_VERTICES = 19_158  # of MakeHuman's base mesh; those of its body come first
+_BASE_VERTICES = 19_158  # vertices of MakeHuman's base mesh, which starts with those of the body
 _TOPOLOGY = "makehuman-noeyes-notongue-tris"
-_FACES = 18_000  # of a target
+_TARGET_FACES = 18_000  # faces of a remeshed target
 COLUMNS = {
     "garment": "garment", "target": "pose", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "95 %": "high_cm:.2f",
     "worst": "worst_cm:.1f", "under the skin": "under:.2%", "exact refit": "truth_under:.2%",
@@ -46,10 +47,11 @@ COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """A garment (.mhclo) or body (.proxy) of MakeHuman: its mesh; of each vertex three vertices of the base mesh, their
-    weights, and an offset.
+    """A garment (.mhclo) or body (.proxy) of MakeHuman, bound to the base mesh.
 
-    ``scales`` are the two vertices whose distance along an axis, divided by a number, stretches offsets along it.
+    Each vertex of ``mesh`` has three vertices of the base mesh (``corners``), their weights, and an offset. ``scales`` has
+    for each axis two base vertices and a reference distance: the distance of the two vertices along the axis, divided by
+    the reference, scales offsets along it.
     """
 
     mesh: Shape
@@ -60,7 +62,7 @@ class Bound:
 
     @classmethod
     def read(cls, path: Path) -> Bound:
-        """A file with its .obj beside it; `InputError` if they do not belong together."""
+        """Read a file and the .obj of the same name; `InputError` if their numbers of vertices differ."""
         words = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
         starts = {row[0]: k for k, row in enumerate(words) if row}
         scales = [words[starts[f"{axis}_scale"]] for axis in "xyz"]
@@ -77,13 +79,15 @@ class Bound:
         return cls(mesh, corners, table[:, 3:6], table[:, 6:], known)
 
     def on(self, base: Floats) -> Shape:
-        """The garment on a base mesh (V, 3) at rest, in metres."""
-        axes = enumerate(self.scales)  # both are in decimetres: the ratio has the unit of the base
+        """Refit the garment to a base mesh (V, 3) at rest, in meters."""
+        axes = enumerate(
+            self.scales
+        )  # offsets and sizes are in decimeters, so that the result is in the unit of the base mesh
         stretch = np.array([abs(base[a, k] - base[b, k]) / size for k, (a, b, size) in axes])
         return self._with(np.einsum("nk,nkd->nd", self.weights, base[self.corners]) + self.offsets * stretch)
 
     def posed(self, base: Floats, moves: Floats) -> Shape:
-        """The same when each vertex of the base mesh moved by an affine map (V, 3, 4)."""
+        """Refit to a base mesh at rest, then pose the garment by the affine maps (V, 3, 4) of the base mesh's vertices."""
         share = np.maximum(self.weights, 0.0)
         own = np.einsum("nk,nkij->nij", share / share.sum(axis=1, keepdims=True), moves[self.corners])
         return self._with(np.einsum("nij,nj->ni", own[:, :, :3], self.on(base).verts) + own[:, :, 3])
@@ -94,7 +98,7 @@ class Bound:
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """Base mesh at rest (V, 3) and in a pose, and how each of its vertices moved (V, 3, 4)."""
+    """Base mesh at rest (V, 3) and in a pose (V, 3), and the affine map (V, 3, 4) of each vertex between them."""
 
     rest: Floats
     posed: Floats
@@ -105,8 +109,8 @@ class Person:
 
 
 def people(count: int, seed: int) -> tuple[list[Person], Ints]:
-    """Generated people, and the triangles of their bodies."""
-    rig = build_rig(count, seed, keep=np.arange(_VERTICES), topology=_TOPOLOGY, dtype=torch.float32)
+    """Generate people; return them and the triangles of their bodies."""
+    rig = build_rig(count, seed, keep=np.arange(_BASE_VERTICES), topology=_TOPOLOGY, dtype=torch.float32)
     world, offset = sample_free_pose(rig, rig.heads, torch.Generator().manual_seed(seed))
     posed = skin(rig, rig.rest, world, offset)
     moves = torch.einsum("vj,bjik->bvik", rig.weights, torch.cat([world, offset[..., None]], dim=-1))
@@ -115,18 +119,18 @@ def people(count: int, seed: int) -> tuple[list[Person], Ints]:
 
 
 def body_of(base: Floats, faces: Ints, name: str, cut: bool) -> Shape:
-    """The body alone, as it is or in other triangles."""
+    """Return the body without the rest of the base mesh; remeshed if ``cut``."""
     body = base[: int(faces.max()) + 1]
     if not cut:
         return Shape(body, faces, name)
     weights, fine = other_triangles(faces, len(body))
-    return decimate(Shape(weights @ body, fine, name), _FACES)
+    return decimate(Shape(weights @ body, fine, name), _TARGET_FACES)
 
 
 def measured(
     garment: Bound, source: Person, target: Person, pose: Pose, found: VertexMap, bodies: tuple[Shape, Shape]
 ) -> Any:
-    """Distances from the exact refit, in centimetres, and what lies under the skin."""
+    """Transfer a garment; return distances from the exact refit, in centimeters, and masks of vertices under the skin."""
     worn, true = source.wears(garment, "rest"), target.wears(garment, pose)
     carried = carry_garment(worn, found, *bodies)
     out = ~inside(bodies[0], worn.verts)
@@ -138,21 +142,22 @@ def measured(
 
 
 def true_map(source: Shape, places: Floats, target: Shape) -> VertexMap:
-    """The map to a target whose surface passes through the true places (V, 3) of the source's vertices."""
+    """Build the map to a target whose surface passes through the true positions (V, 3) of the source's vertices."""
     found = MappedMesh.of(target).query(places)
     return VertexMap.between(source, target, found.vertex, face=found.face, barycentric=found.barycentric)
 
 
 def inside(body: Shape, points: Floats) -> Bools:
-    """Which points (N,) are inside a body, by rays through it."""
+    """Return which points (N,) are inside a body, by ray casting."""
     return np.asarray(body.to_trimesh().contains(points))
 
 
 def rows_of(
     garments: dict[str, Bound], pose: Pose, count: int, matcher: Matcher | None, seed: int
 ) -> list[dict[str, Any]]:
-    """A row for each garment, over all pairs of neighbours in a circle of people; and one for all together. Without a
-    matcher, along the true map.
+    """Compute a row for each garment and one for all together, over all pairs of neighbors in a circle of people.
+
+    Without a matcher, garments are transferred by the true map.
     """
     crowd, faces = people(count, seed)
     found: dict[str, list[Any]] = {name: [] for name in garments}
@@ -183,7 +188,7 @@ def main(
     data: runner.Data = runner.DATA,
     poses: Annotated[str, Option(help=f"of {', '.join(get_args(Pose))}")] = ",".join(get_args(Pose)),
     count: Annotated[int, Option(min=2, help="generated people")] = 4,
-    exact_map: Annotated[bool, Option("--exact-map", help="carry along the true map")] = False,
+    exact_map: Annotated[bool, Option("--exact-map", help="transfer by the true map instead of a match")] = False,
     model: runner.Model = "human",
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,

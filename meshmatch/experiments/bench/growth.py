@@ -1,8 +1,8 @@
-"""How the cost of each step grows with what a file can hold many of: parts, holes, names, materials, images, joints.
+"""Scaling of each step's cost with the number of parts, holes, names, materials, images or joints of a file.
 
-Files and shapes are made with 100, 1,000 and 10,000 of each, and what reads, repairs or transfers them is timed: seconds of
-CPU, and the exponent of the growth between the two largest counts: 1 is linear, 2 the square. What a step costs whatever
-the count makes exponents smaller than they are, so that only rows of some seconds tell much.
+Files and shapes with 100, 1,000 and 10,000 of each are generated, and reading, repairing or transferring them is timed in
+CPU seconds. The exponent is that of a power law through the two largest counts: 1 is linear, 2 quadratic. Constant costs
+lower the exponents, so that only rows of at least some seconds are informative.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Step = Callable[[], object]
 
 
 def grid(side: int) -> tuple[Floats, Ints]:
-    """A square of 2 (side - 1)^2 triangles, two of each cell beside each other."""
+    """Build a square of 2 (side - 1)^2 triangles; the two triangles of a cell are consecutive."""
     across, up = np.meshgrid(np.arange(side), np.arange(side))
     at = np.arange(side * side).reshape(side, side)
     a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
@@ -52,31 +52,31 @@ def grid(side: int) -> tuple[Floats, Ints]:
 
 
 def loose(n: int, gap: float = 0.0) -> Shape:
-    """n triangles of a square, each with corners of its own, drawn together by a share."""
+    """Build n triangles of a square without shared vertices, each shrunk about its centroid by the fraction ``gap``."""
     verts, faces = grid(math.isqrt(n // 2) + 2)
     corners = verts[faces[:n]]
     middle = corners.mean(axis=1, keepdims=True)
     return Shape((middle + (1 - gap) * (corners - middle)).reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
 
 
-def judged(shape: Shape) -> object:
-    """Repaired, and asked what a fit asks before it begins."""
+def repair_and_check(shape: Shape) -> object:
+    """Repair a shape and run the checks that precede a fit."""
     clean = repair(shape).shape
     return boundary_length(clean), remove_hidden_faces(clean)
 
 
 def holes(n: int, _: Path) -> Step:
-    """A square with n holes, one in each block of three cells by three."""
+    """Repair and check a square with n holes, one in each block of three by three cells."""
     side = 3 * math.isqrt(n - 1) + 4
     verts, faces = grid(side)
     cell = np.arange(len(faces)) // 2
     row, column = np.divmod(cell, side - 1)
     hole = (row % 3 == 1) & (column % 3 == 1)
-    return lambda: judged(Shape(verts, faces[~hole]))
+    return lambda: repair_and_check(Shape(verts, faces[~hole]))
 
 
 def parts_to_parts(n: int, _: Path) -> Step:
-    """Four plates, each with a quarter of n loose triangles that belong beside themselves."""
+    """Match the parts of four plates, each with a quarter of n separate triangles that map near themselves."""
     verts, faces = grid(6)
     small = loose(max(n // 4, 1), 0.5)
     pieces = [(verts + np.array([0, 0, 9 * k]), faces) for k in range(4)]
@@ -108,7 +108,7 @@ def parts_to_parts(n: int, _: Path) -> Step:
 
 
 def scene(path: Path, nodes: list[dict[str, Any]], **more: Any) -> Path:
-    """A glTF with one triangle, drawn by all nodes that ask for it."""
+    """Write a glTF whose nodes share one triangle."""
     values = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4"), np.array([[0, 0], [1, 0], [0, 1]], "<f4")
     bones, weights = np.zeros((3, 4), "<u1"), np.tile(np.array([1, 0, 0, 0], "<f4"), (3, 1))
     data = b"".join(array.tobytes() for array in (*values, bones, weights))
@@ -148,7 +148,7 @@ def nodes(n: int, folder: Path) -> Step:
 
 
 def chain(n: int, folder: Path) -> Step:
-    """Nodes that hang from one another; joints of one name, and a mesh on each."""
+    """Read a chain of nodes, all of which are joints with the same name and draw a mesh."""
     made: list[dict[str, Any]] = [{"mesh": 0, "skin": 0, "name": "same", "children": [k + 1]} for k in range(n)]
     made[-1].pop("children")
     path = scene(folder / "chain.gltf", made, skins=[{"joints": list(range(n))}])
@@ -166,7 +166,7 @@ def morphs(n: int, folder: Path) -> Step:
 
 
 def images(n: int, folder: Path) -> Step:
-    """A mesh, a material and an image for each node."""
+    """Sample a scene with a mesh, a material and an image for each node."""
     attributes = {"POSITION": 0, "TEXCOORD_0": 1}
     path = scene(
         folder / "images.gltf",
@@ -176,22 +176,22 @@ def images(n: int, folder: Path) -> Step:
         textures=[{"source": k} for k in range(n)],
         images=[{"uri": _uri("image/png", png())} for _ in range(n)],
     )
-    return lambda: sampled(path)
+    return lambda: sample_colors(path)
 
 
 def materials(n: int, folder: Path) -> Step:
-    """An obj with n materials that share an image, each triangle a chart of its own."""
+    """Sample an obj with n materials that share an image; each triangle is a chart."""
     path, shape = folder / "materials.obj", loose(n, 0.1)
     (folder / "m.png").write_bytes(png())
     (folder / "m.mtl").write_text("".join(f"newmtl m{k}\nKd 1 0 0\nmap_Kd m.png\n" for k in range(n)))
     rows = [f"v {x} {y} {z}" for x, y, z in shape.verts.tolist()] + ["vt 0 0", "vt 1 0", "vt 0 1"]
     rows += [f"g g{k}\nusemtl m{k}\nf {3 * k + 1}/1 {3 * k + 2}/2 {3 * k + 3}/3" for k in range(n)]
     path.write_text("\n".join(["mtllib m.mtl", *rows, ""]))
-    return lambda: sampled(path)
+    return lambda: sample_colors(path)
 
 
-def sampled(path: Path) -> object:
-    """Read with its look, and the color in the middle of each face asked for."""
+def sample_colors(path: Path) -> object:
+    """Read a file with its appearance and sample the color at the centroid of each face."""
     shape = load_shape(path)
     sampler = MaterialSampler(load_appearance(path, shape), SurfaceWalker(shape))
     third = np.full((3, shape.F), 1 / 3, np.float32)
@@ -211,10 +211,10 @@ def landmarks(n: int, _: Path) -> Step:
 
 
 STEPS: dict[str, Callable[[int, Path], Step]] = {
-    "parts": lambda n, _: lambda: judged(loose(n, 0.1)),
+    "parts": lambda n, _: lambda: repair_and_check(loose(n, 0.1)),
     "parts to parts": parts_to_parts,
     "boundary loops": holes,
-    "duplicate vertices": lambda n, _: lambda: judged(loose(n)),
+    "duplicate vertices": lambda n, _: lambda: repair_and_check(loose(n)),
     "nodes and names": nodes,
     "joints in a chain": chain,
     "morph targets": morphs,
@@ -236,7 +236,7 @@ def main(
     with tempfile.TemporaryDirectory() as folder:
         for name in runner.track(runner.split_names(steps, STEPS, "step"), "running"):
             row: dict[str, Any] = {"step": name}
-            STEPS[name](10, Path(folder))()  # what is loaded once is not counted
+            STEPS[name](10, Path(folder))()  # warm-up: imports and caches are not counted
             for count in [count for count in COUNTS if count <= most]:
                 step = STEPS[name](count, Path(folder))
                 began = time.process_time()

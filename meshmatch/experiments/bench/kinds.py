@@ -1,14 +1,14 @@
-"""Animals, hands and heads through models that have never seen one of them, or without a model.
+"""Animals, hands and heads that the models were not trained on, matched with a model or without.
 
-Cats, dogs, cows, horses and hippos of the benchmark, each fitted once and turned every way; then every ordered pair is
-matched as `match` does it, and every landmark counts. The error is the distance along the target between the matched and
-the true point, in units of sqrt(area), times 100; "off" is the share of points beyond 10. Beside it how far the verdicts
-tell the truth: the worse one of the two fits, and the error of the pair.
+Cats, dogs, cows, horses and hippos of the benchmark are each fitted once; then every ordered pair is matched as `match`
+does it, and every landmark counts. The error is the geodesic distance on the target between the matched and the true point,
+in units of sqrt(area), times 100; "off" is the share of points beyond 10. A second table has the errors by verdict, the
+worse one of the two fits.
 
-Hands and heads are generated (meshmatch/experiments/makers/cut_scans.py): of people and in poses that no training
-drew, with other triangles, cut at random, turned anywhere, every other one with a thing beside it, and hands of both
-sides; a table says how many sides were found, and how many pairs of one wrong side were called good. Their errors are
-in percent of the length of the hand (wrist to fingertips) or the head (chin to crown).
+Hands and heads are generated (meshmatch/experiments/makers/cut_scans.py): identities and poses that training did not use,
+remeshed, cut at random, in random orientations, every other one next to another object, and hands of both sides. A table
+has the share of hands whose side was found, and the number of pairs with one wrong side that were called good. Their errors
+are in percent of the length of the hand (wrist to fingertips) or the head (chin to crown).
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.models.registry import NO_MODEL
 
-OFF = 0.1
-"""In units of sqrt(area): a point further off is lost."""
+LOST = 0.1
+"""Error, in units of sqrt(area), beyond which a point is lost."""
 SETS = ("animals", "hand", "head")
 MODELS = {"animals": "quadruped"}
-"""Of the sets that are not named as theirs."""
+"""Models of the sets that are not named like their model."""
 TRUTH = ".landmarks.npy"
 _SPECIES = {
     "dog": ("dog", "wolf", "fox", "inuit"),
@@ -58,8 +58,15 @@ Group = Callable[[Pair], str]
 
 @dataclass(frozen=True, eq=False)
 class Subjects:
-    """Shapes of a set, how their maps are measured, by what else than verdicts their pairs are grouped, and of sided ones
-    which are left.
+    """Shapes of a set and how to measure their maps.
+
+    Parameters
+    ----------
+    title : the unit of errors, for the table's title
+    shapes : shapes by name
+    errors : function from maps of pairs to the errors at the points of each pair
+    groups : by table title, a function that groups pairs, in addition to grouping by verdict
+    left : for hands, whether each one is a left hand
     """
 
     title: str
@@ -70,13 +77,13 @@ class Subjects:
 
 
 def species_of(name: str) -> str:
-    """The species that an animal's file is named after; "other" where its name says nothing."""
+    """Return the species from an animal's file name; "other" if it names none."""
     words = name.lower()
     return next((kind for kind, signs in _SPECIES.items() if any(sign in words for sign in signs)), "other")
 
 
 def rows_of(errors: Errors, group: Group) -> list[dict[str, Any]]:
-    """A row for every group of pairs, with the mean over pairs of their means, medians and shares beyond `OFF`."""
+    """Compute a row for every group of pairs: mean and median of their mean errors, and the mean share beyond `LOST`."""
     groups: dict[str, list[np.ndarray]] = defaultdict(list)
     for pair, values in errors.items():
         groups[group(pair)].append(values)
@@ -86,7 +93,7 @@ def rows_of(errors: Errors, group: Group) -> list[dict[str, Any]]:
             "pairs": len(each),
             "mean_x100": round(100 * float(np.mean([values.mean() for values in each])), 4),
             "median_x100": round(100 * float(np.median([values.mean() for values in each])), 4),
-            "off": round(float(np.mean([(values > OFF).mean() for values in each])), 4),
+            "off": round(float(np.mean([(values > LOST).mean() for values in each])), 4),
         }
         for name, each in sorted(groups.items())
     ]
@@ -95,7 +102,7 @@ def rows_of(errors: Errors, group: Group) -> list[dict[str, Any]]:
 def geodesic_errors(
     shapes: Shapes, truth: Mapping[str, Ints], cache: Path | None, maps: Mapping[Pair, VertexMap]
 ) -> Errors:
-    """Distances along the target at every landmark of every pair, in units of sqrt(area)."""
+    """Compute geodesic distances on the target at every landmark of every pair, in units of sqrt(area)."""
     found: Errors = {}
     for target in runner.track(sorted({b for _, b in maps}), "measuring"):
         mine = [pair for pair in maps if pair[1] == target]
@@ -106,7 +113,7 @@ def geodesic_errors(
 
 
 def animals(data: Path, limit: int | None, cache: Path | None) -> Subjects:
-    """Those of the evaluation data."""
+    """Load the animals of the evaluation data."""
     shapes, truth = load_folder(data / "animal", TRUTH)
     shapes = {name: shapes[name] for name in runner.evenly_spread(list(shapes), limit)}
     groups: dict[str, Group] = {"species": lambda pair: " to ".join(map(species_of, pair))}
@@ -114,7 +121,7 @@ def animals(data: Path, limit: int | None, cache: Path | None) -> Subjects:
 
 
 def cut_scans(kind: str, count: int, seed: int, cache: Path | None) -> Subjects:
-    """Generated hands or heads."""
+    """Generate hands or heads."""
     scans = {scan.shape.name: scan for scan in make_scans(kind, count, seed)}
     side = {name: "left" if scan.mirrored else "right" for name, scan in scans.items()}
     return Subjects(
@@ -129,8 +136,10 @@ def cut_scans(kind: str, count: int, seed: int, cache: Path | None) -> Subjects:
 def measured(
     name: str, subjects: Subjects, matcher: Matcher, limit: int | None = None, direct: bool = False
 ) -> tuple[dict[str, Any], list[Table]]:
-    """Record and tables of all pairs of a set, or of ``limit`` of them: all together, by groups, by the worse verdict;
-    ``direct`` without a model."""
+    """Measure all pairs of a set, or ``limit`` of them; ``direct`` matches without a model.
+
+    Return the record and the tables: all pairs together, by verdict, and by each other grouping.
+    """
     pairs, fits = ordered_pairs(subjects.shapes, limit), dict[str, Fit]()
     if direct:
         found = matched_directly(matcher, subjects.shapes, pairs, name)
@@ -158,10 +167,10 @@ def measured(
 def main(
     data: runner.Data = runner.DATA,
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
-    model: Annotated[str | None, Option(help="default: the kind's own; or none")] = None,
+    model: Annotated[str | None, Option(help="default: that of the kind; or none")] = None,
     limit_pairs: runner.LimitPairs = None,
-    limit_shapes: Annotated[int | None, Option(min=2, help="animals, evenly spread")] = None,
-    scans: Annotated[int, Option(min=2, help="hands, and heads")] = 10,
+    limit_shapes: Annotated[int | None, Option(min=2, help="number of animals, evenly spread")] = None,
+    scans: Annotated[int, Option(min=2, help="number of hands, and of heads")] = 10,
     cache: runner.Cache = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,

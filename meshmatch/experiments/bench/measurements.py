@@ -1,11 +1,12 @@
-"""How well measurements of a person repeat over poses: `meshmatch measure body` of scans of the same people.
+"""Repeatability of body measurements over poses: `meshmatch measure body` on scans of the same people.
 
-A tape around a thigh says the same in every pose, but for muscles and skin; so the spread over the poses of one person
-bounds the errors of maps. What poses do themselves is seen beside it: the same lines, carried from the first pose of each
-person to the others by the true correspondences, which are rounded to vertices. Shoulders and bent hands do differ.
+The girth of a thigh is nearly the same in every pose, but for muscles and skin, so that the spread over the poses of one
+person bounds the errors of maps. The effect of the poses themselves is given for comparison: the same lines, transferred
+from the first pose of each person to the others by the true correspondences, which are rounded to vertices. Shoulders and
+bent hands really change.
 
-In centimeters, on bodies scaled to 1.9 square meters of skin. A spread is the standard deviation within a person, over
-poses, pooled over people; left and right are pooled too.
+Values are in centimeters, on bodies scaled to 1.9 square meters of skin. A spread is the standard deviation within a
+person over poses, pooled over people and over left and right.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ COLUMNS = {
 
 
 def people_of(name: str, shapes: Iterable[str]) -> dict[str, list[str]]:
-    """The shapes of each person: SCAPE has one, FAUST ten consecutive numbers of each."""
+    """Group shapes by person: SCAPE has one person, FAUST ten consecutive numbers for each."""
     found: dict[str, list[str]] = {}
     for shape in shapes:
         found.setdefault(name if name == "scape" else f"{name} {int(shape.removeprefix('tr_reg_')) // 10}", []).append(
@@ -42,7 +43,7 @@ def people_of(name: str, shapes: Iterable[str]) -> dict[str, list[str]]:
 
 
 def measured(bench: BenchSet, shapes: list[str], matcher: meshmatch.Matcher, body: meshmatch.Fit) -> list[list[Floats]]:
-    """(2, N) for each shape: measurements by `measure`, and by the true correspondences from the first shape."""
+    """Measure each shape; (2, N): by `measure`, and by the true correspondences from the first shape."""
     points, found = measuring_points(BODY), []
     first = bench.shape(shapes[0])
     places = None
@@ -59,26 +60,26 @@ def measured(bench: BenchSet, shapes: list[str], matcher: meshmatch.Matcher, bod
     return found
 
 
-def _name(measurement: str) -> str:
+def _without_side(measurement: str) -> str:
     return measurement.removeprefix("left ").removeprefix("right ")
 
 
 def _spread(people: list[Float[Floats, "S M"]]) -> float:
-    """The standard deviation within people, of S scans with M measurements each; nan if none was taken twice."""
+    """Pooled standard deviation within people; nan if no measurement was taken twice."""
     apart = [values - np.nanmean(values, axis=0) for values in people]
     free = sum(int((np.isfinite(each).sum(axis=0) - 1).sum()) for each in apart)
     return float(np.sqrt(sum(float(np.nansum(each**2)) for each in apart) / free)) if free else np.nan
 
 
-def _columns(values: Float[Floats, "S M"]) -> Float[Floats, "S N"]:
-    """The measurements that were taken of a person at least once."""
+def _taken_columns(values: Float[Floats, "S M"]) -> Float[Floats, "S N"]:
+    """Select the measurements that were taken of a person at least once."""
     return np.asarray(values[:, np.isfinite(values).any(axis=0)])
 
 
 def _row(name: str, people: list[Float[Floats, "S 2 M"]]) -> dict[str, Any]:
-    """Of S scans of each person, and M measurements, on both sides of the body."""
+    """Compute a table row from S scans per person and the M sides of a measurement, by maps and by true correspondences."""
     missing = int(sum(np.isnan(values[:, 0]).sum() for values in people))
-    ours, true = ([_columns(values[:, k]) for values in people] for k in range(2))
+    ours, true = ([_taken_columns(values[:, k]) for values in people] for k in range(2))
     mean = float(np.nanmean(np.concatenate([each.ravel() for each in ours])))
     spread = _spread(ours)
     return {
@@ -113,8 +114,8 @@ def main(
             np.array(measured(bench, runner.evenly_spread(own, limit_shapes), matcher, body))
             for own in people_of(name, bench.shapes).values()
         ]
-        for each in dict.fromkeys(map(_name, names)):
-            own = [k for k, full in enumerate(names) if _name(full) == each]
+        for each in dict.fromkeys(map(_without_side, names)):
+            own = [k for k, full in enumerate(names) if _without_side(full) == each]
             rows.append({"set": name} | _row(each, [values[:, :, own] for values in people]))
     tables = [
         runner.table(f"Measurements of the people of {name}", [row for row in rows if row["set"] == name], COLUMNS)

@@ -1,8 +1,8 @@
-"""What the benchmark measures: the interface of a method, this project behind it, and other methods.
+"""Methods that the benchmark measures: their interface, this project, and methods of other libraries.
 
-Those that know no category and bend one shape onto the other begin with the same rigid alignment: both shapes scaled to
-area 1 and centered, all orientations tried (`shapes.align`). The libraries do the work. One that gives up on a pair fails
-that pair (`InputError`); a bug of ours stays a bug.
+Methods without a category model that deform one shape onto the other start from the same rigid alignment: both shapes are
+scaled to area 1 and centered, and all orientations are tried (`shapes.align`). An error of a library on a pair becomes an
+`InputError`, a failure of that pair; other exceptions are raised.
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ from meshmatch.shapes.shape import Shape
 
 _SAMPLES = 2400
 MONK_UNIT = 100.0
-"""What sqrt(area) is for meshmonk, whose defaults are for faces in millimeters."""
+"""Value of sqrt(area) for meshmonk, whose defaults are meant for faces in millimeters."""
 
 
 class Method(Protocol):
-    """What is measured: something that fits one shape, and makes a map of two fits. It must survive a pickle."""
+    """A method that fits single shapes and maps pairs of fits; must be picklable."""
 
     def fit(self, shape: Shape) -> Any:
-        """Whatever is worth knowing about one shape."""
+        """Compute what depends on one shape alone."""
 
     def map(self, source: Shape, source_fit: Any, target: Shape, target_fit: Any) -> VertexMap:
-        """The map between two shapes that were fitted."""
+        """Map one fitted shape to another."""
 
 
 @dataclass(frozen=True)
 class OurMethod:
     """This project with its options.
 
-    ``kept``: a folder of fits, of this method alone; a shape that has one there is not fitted again.
+    ``kept`` is a folder of fits by this method with these options; a shape with a fit there is not fitted again.
     """
 
     model: str = "human"
@@ -69,7 +69,7 @@ class OurMethod:
     partial: Partial = "auto"
     threads: int = 1
     kept: Path | None = None
-    latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)  # of the search over codes
+    latent: LatentRefineConfig = field(default_factory=LatentRefineConfig)  # refinement of the latent code
     quick: bool = False
 
     def _matcher(self) -> Matcher:
@@ -78,7 +78,7 @@ class OurMethod:
         return Matcher(self.model, config, self.threads)
 
     def fit(self, shape: Shape) -> Fit:
-        """Fit the model's template to the shape; `MeshmatchError` of a kept fit of another template, or a damaged one."""
+        """Fit the model's template to the shape; `MeshmatchError` if a stored fit is damaged or has another template."""
         path = None if self.kept is None else self.kept / f"{shape.hash}.safetensors"
         if path is not None and path.is_file():
             known, clean = read_fit(path, as_model(self.model).template), repair_or_raise(shape)
@@ -96,31 +96,30 @@ class OurMethod:
 
 @dataclass(frozen=True)
 class DirectMethod:
-    """This project without a model: nothing is known of one shape alone."""
+    """This project without a model: there are no fits of single shapes."""
 
     seed: int = 0
     threads: int = 1
 
     def fit(self, shape: Shape) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def map(self, source: Shape, source_fit: None, target: Shape, target_fit: None) -> VertexMap:
-        """The map of two shapes that are registered to each other."""
+        """Register two shapes to each other and return the map."""
         return Matcher(NO_MODEL, FitConfig(seed=self.seed), self.threads).match(source, target).map
 
 
 @dataclass(frozen=True)
 class EarlierVersion:
-    """`fit --model none` of both shapes and the map of these fits, as an earlier version did them: by its own commands, in a
-    checkout of it."""
+    """An earlier version of this project, run by its commands `fit --model none` and `map` in a checkout."""
 
     checkout: Path
 
     def fit(self, shape: Shape) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def map(self, source: Shape, source_fit: None, target: Shape, target_fit: None) -> VertexMap:
-        """Fit both, map."""
+        """Fit both shapes and map one to the other."""
         with TemporaryDirectory() as folder:
             for name, shape in (("source", source), ("target", target)):
                 save_shape(Path(folder) / f"{name}.ply", shape)
@@ -130,7 +129,7 @@ class EarlierVersion:
         return VertexMap.between(source, target, index)
 
     def _run(self, folder: str, *words: str) -> None:
-        """`InputError` with the last line of what the command says, if it fails."""
+        """Run a command; `InputError` with the end of its stderr if it fails."""
         environment = {**os.environ, "PYTHONPATH": str(self.checkout.resolve())}
         command = [sys.executable, "-m", "meshmatch", *words, "--quiet"]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -139,43 +138,45 @@ class EarlierVersion:
 
 
 def in_frame(shape: Shape, frame: Frame) -> Shape:
-    """The same shape, vertex by vertex, in another frame than its file's."""
+    """Transform the vertices of a shape from its file's coordinates to a frame."""
     return replace(shape, verts=frame.apply(shape.verts))
 
 
 def coded(model: str, steps: int = 2000, seed: int = 0) -> OurMethod:
-    """3D-CODED, a model of ``meshmatch train --preset paper --field pointwise`` whose losses had no constraint (``--volume 0
-    --arap 0 --blend 0``): its code is refined by the Chamfer distance alone.
+    """Return 3D-CODED as a method: the code is refined by the Chamfer distance alone.
+
+    ``model`` was trained by ``meshmatch train --preset paper --field pointwise`` without regularization (``--volume 0
+    --arap 0 --blend 0``).
     """
     latent = replace(LatentRefineConfig(steps=steps), volume=0.0, arap=0.0)
     return OurMethod(model, "latent", seed, "no", latent=latent)
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A shape of area 1, centered, and samples of it; ``thin`` is the same with fewer triangles, where asked for."""
+class NormalizedShape:
+    """A centered shape of area 1, a decimated copy of it (``thin``; the same if not decimated), and samples."""
 
     whole: Shape
     thin: Shape
     samples: OrientedPoints
 
 
-def placed(shape: Shape, seed: int = 0, faces: int | None = None) -> Placed:
-    """Scale a shape to area 1, center it, sample it, and thin it to about so many faces."""
+def normalize_shape(shape: Shape, seed: int = 0, faces: int | None = None) -> NormalizedShape:
+    """Scale a shape to area 1, center it, sample it, and decimate it to about ``faces`` faces."""
     frame = sqrt_area_frame(shape)
     drawn = sample_surface(shape, _SAMPLES, np.random.default_rng(seed))
     whole = in_frame(shape, frame)
     thin = whole if faces is None or whole.is_cloud else decimate(whole, faces)
-    return Placed(whole, thin, drawn.in_frame(frame))
+    return NormalizedShape(whole, thin, drawn.in_frame(frame))
 
 
-def turn_to(source: Placed, target: Placed) -> Frame:
-    """The rigid motion that brings a source onto a target."""
+def align_rigidly(source: NormalizedShape, target: NormalizedShape) -> Frame:
+    """Find the rigid motion that aligns a source with a target."""
     return align(source.samples, target.samples, "rigid")[0].pose.frame
 
 
-def carried(source: Placed, moved: Float[Floats, "V_thin 3"]) -> Float[Floats, "V_src 3"]:
-    """Where the whole source's vertices go when those of the thin one go to ``moved``."""
+def interpolate_thin(source: NormalizedShape, moved: Float[Floats, "V_thin 3"]) -> Float[Floats, "V_src 3"]:
+    """Interpolate positions of the decimated source's vertices at the vertices of the whole source."""
     thin = source.thin
     surface = Surface(thin.verts, thin.faces, thin.vertex_normals)
     foot = surface.query(source.whole.verts, source.whole.vertex_normals)
@@ -183,14 +184,14 @@ def carried(source: Placed, moved: Float[Floats, "V_thin 3"]) -> Float[Floats, "
 
 
 def need_meshes(name: str, shape: Shape) -> None:
-    """Refuse clouds (`InputError`)."""
+    """Raise `InputError` for point clouds."""
     if shape.is_cloud:
         raise InputError(f"{name} needs triangles: {shape.name} is a point cloud")
 
 
 @contextmanager
 def library(name: str) -> Iterator[None]:
-    """What a library does with its input: failures become `InputError`, its warnings and words go nowhere."""
+    """Context for calls of a library: failures become `InputError`; warnings and stderr are suppressed."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
@@ -207,33 +208,33 @@ def library(name: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Registration:
-    """Rigid alignment, a registration of the source (thinned to ``faces``) onto the target, the nearest vertex.
+    """Rigid alignment, registration of the source (decimated to ``faces``) onto the target, and nearest vertices.
 
     - rigid: no registration.
-    - nricp: non-rigid ICP (Amberg et al. 2007) of trimesh with its own weights. Nearest points are the target's
-      vertices: the nearest on its faces would take rtree. Landmarks are not given.
-    - meshmonk: viscoelastic registration with its defaults; the target is thinned too.
+    - nricp: non-rigid ICP (Amberg et al. 2007) of trimesh with its own weights. Nearest points are target
+      vertices; nearest points on faces would need rtree. No landmarks are given.
+    - meshmonk: viscoelastic registration with its defaults; the target is decimated too.
     """
 
     kind: Literal["rigid", "nricp", "meshmonk"]
     faces: int | None = None
     seed: int = 0
 
-    def fit(self, shape: Shape) -> Placed:
-        """Scale, center, sample, thin."""
+    def fit(self, shape: Shape) -> NormalizedShape:
+        """Scale, center, sample and decimate."""
         if self.kind != "rigid":
             need_meshes(self.kind, shape)
-        return placed(shape, self.seed, self.faces)
+        return normalize_shape(shape, self.seed, self.faces)
 
-    def map(self, source: Shape, source_fit: Placed, target: Shape, target_fit: Placed) -> VertexMap:
-        """Align, register."""
-        turn = turn_to(source_fit, target_fit)
+    def map(self, source: Shape, source_fit: NormalizedShape, target: Shape, target_fit: NormalizedShape) -> VertexMap:
+        """Align, register, and map to nearest vertices."""
+        turn = align_rigidly(source_fit, target_fit)
         if self.kind == "rigid":
             moved = turn.apply(source_fit.whole.verts)
         else:
             register = nricp if self.kind == "nricp" else viscoelastic
             thin, there = source_fit.thin, target_fit.thin if self.kind == "meshmonk" else target_fit.whole
-            moved = carried(
+            moved = interpolate_thin(
                 source_fit,
                 register(
                     (turn.apply(thin.verts), thin.vertex_normals @ turn.rotation.T, thin.faces),
@@ -250,7 +251,7 @@ Mesh = tuple[Floats, Floats, Ints]
 
 
 def nricp(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
-    """trimesh: where the vertices of a floating mesh go."""
+    """Register a floating mesh by trimesh's non-rigid ICP; return its deformed vertices."""
     import trimesh
 
     with library("nricp"):
@@ -260,7 +261,7 @@ def nricp(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
 
 
 def viscoelastic(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
-    """meshmonk: where the vertices of a floating mesh go."""
+    """Register a floating mesh by meshmonk; return its deformed vertices."""
     import meshmonk
 
     with library("meshmonk"):
@@ -275,20 +276,20 @@ def viscoelastic(floating: Mesh, target: Mesh) -> Float[Floats, "V 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """A thinned mesh of pyFM (V_thin vertices, area 1) with its eigenfunctions."""
+    """A decimated mesh of pyFM (V_thin vertices, area 1) with its eigenfunctions."""
 
     mesh: Any
-    at: Float[Floats, "V k"]  # the eigenfunctions at the original's vertices
-    original: Int[Ints, " V_thin"]  # the original vertex nearest to each of the thinned mesh
+    at: Float[Floats, "V k"]  # eigenfunctions at the vertices of the original mesh
+    original: Int[Ints, " V_thin"]  # nearest original vertex of each vertex of the decimated mesh
 
 
 @dataclass(frozen=True)
 class ZoomOut:
-    """pyfmaps: HKS and WKS give a functional map of ``first`` functions; ZoomOut takes it to ``last`` by ``step``.
+    """Functional maps by pyfmaps: fitted to HKS and WKS at size ``first``, upsampled by ZoomOut to ``last`` by ``step``.
 
-    Meshes of more than ``faces`` triangles are thinned to that first. Source vertices keep their exact place in the
-    spectrum; targets are the vertices nearest to the thinned mesh's, so large targets cost about half an edge there.
-    ``first`` and the weight of orientation were the best of seven choices on seven pairs of the benchmark.
+    Meshes of more than ``faces`` triangles are decimated to that first. Source vertices have exact spectral coordinates;
+    targets are the vertices nearest to those of the decimated mesh, which costs about half an edge of it on large targets.
+    ``first`` and the weight ``orient`` were the best of seven choices on seven pairs of the benchmark.
     """
 
     faces: int = 10_000
@@ -300,11 +301,13 @@ class ZoomOut:
     seed: int = 0
 
     def fit(self, shape: Shape) -> Spectrum:
-        """Thin, and find the eigenfunctions."""
+        """Decimate the mesh and compute its eigenfunctions."""
         need_meshes("ZoomOut", shape)
         whole = in_frame(shape, sqrt_area_frame(shape))
         thin = decimate(whole, self.faces)
-        used, faces = np.unique(thin.faces, return_inverse=True)  # a lone vertex makes the mass matrix singular
+        used, faces = np.unique(
+            thin.faces, return_inverse=True
+        )  # an unreferenced vertex makes the mass matrix singular
         thin = Shape(thin.verts[used], faces.reshape(-1, 3), thin.name)
         with library("ZoomOut"):
             from pyFM.mesh import TriMesh
@@ -317,21 +320,21 @@ class ZoomOut:
         return Spectrum(mesh, at, cKDTree(whole.verts).query(thin.verts)[1])
 
     def map(self, source: Shape, source_fit: Spectrum, target: Shape, target_fit: Spectrum) -> VertexMap:
-        """Fit the functional map from target to source, which pulls vertices from source to target, and refine it."""
+        """Fit the functional map from target to source, refine it, and convert it to a vertex map from source to target."""
         first, second = target_fit.mesh, source_fit.mesh
         with library("ZoomOut"):
             from pyFM.refine.zoomout import zoomout_refine
             from pyFM.spectral import FM_to_p2p
 
-            coarse = self._described(first, second)
+            coarse = self._fit_descriptors(first, second)
             rounds = (self.last - self.first) // self.step
             vectors = first.eigenvectors, second.eigenvectors
             refined = zoomout_refine(coarse, *vectors, rounds, self.step, A2=second.A, n_jobs=1)
             index = FM_to_p2p(refined, first.eigenvectors, source_fit.at, n_jobs=1)
         return VertexMap.between(source, target, target_fit.original[index])
 
-    def _described(self, first: Any, second: Any) -> Float[Floats, "k k"]:
-        """The functional map from one mesh to another that preserves their descriptors best."""
+    def _fit_descriptors(self, first: Any, second: Any) -> Float[Floats, "k k"]:
+        """Fit the functional map between two meshes to their descriptors."""
         from pyFM.functional import FunctionalMapping
         from pyFM.signatures import mesh_HKS
 

@@ -1,4 +1,4 @@
-"""The loops of the benchmarks of kinds and characters: pairs matched as `match` does, by fits or without a model."""
+"""Match pairs as `match` does, by fits or without a model, for the benchmarks of kinds, characters and splits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERDICTS = ("good", "fair", "poor")
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """The map of a pair, the worse verdict of its fits, and the CPU seconds of all that it took."""
+    """The map of a pair, the worse verdict of its fits, and the CPU seconds of fits and map."""
 
     map: VertexMap
     verdict: str
@@ -27,7 +27,7 @@ class Matched:
 def matched(
     matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str
 ) -> tuple[dict[str, Fit], dict[Pair, Matched]]:
-    """Fits by name, and maps by pair."""
+    """Fit all shapes and map all pairs; return fits by name and maps by pair."""
     fits, spent = {}, {}
     for name, shape in track(shapes.items(), f"{what}: fitting", len(shapes)):
         began = time.process_time()
@@ -43,7 +43,7 @@ def matched(
 
 
 def matched_directly(matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str) -> dict[Pair, Matched]:
-    """Maps by pair, each without a model."""
+    """Match all pairs without a model; return maps by pair."""
     found = {}
     for a, b in track(pairs, what, len(pairs)):
         began = time.process_time()

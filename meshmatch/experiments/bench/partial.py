@@ -1,13 +1,13 @@
-"""Parts matched to wholes.
+"""Partial shapes matched to whole ones.
 
-Each source is one of two parts of a shape of the benchmark, the target another whole shape:
+Each source is one of two kinds of parts of a shape of the benchmark; the target is another, whole shape:
 
-- view: the faces that a camera far away sees, by ray casting; a random direction for each source;
-- cut: what lies on one side of a plane across a random direction, between half and 90 % of the faces.
+- view: the faces visible to a distant camera in a random direction, by ray casting;
+- cut: the faces on one side of a plane perpendicular to a random direction, between 50 and 90 % of the faces.
 
-Errors are geodesic, in centimeters at 1.9 m2 of skin, at the source's landmarks that are left; their mean is over pairs.
-How well the map knows where it is wrong: the area under the curve (AUC) of confidence telling errors below 15 cm from
-those above; 0.5 is guessing. --partial auto is what `meshmatch match` does, no is without fits of parts.
+Errors are geodesic, in centimeters at 1.9 m2 of skin, at the remaining landmarks of the source; their mean is over pairs.
+The AUC is the area under the ROC curve of confidence as a predictor of errors below 15 cm; 0.5 is chance. --partial auto is
+what `meshmatch match` does; with no, sources are fitted as whole shapes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from meshmatch.shapes.shape import Shape
 
 Kind = Literal["view", "cut"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-_LEFT = (0.5, 0.9)  # share of the faces that a cut leaves, at least and at most
+_KEPT_SHARE = (0.5, 0.9)  # minimum and maximum share of the faces that a cut leaves
 COLUMNS = {
     **{"set": "set", "part": "part", "pairs": "pairs", "mean": "mean_cm:.2f", "median": "median_cm:.2f"},
     **{"median pair": "median_pair_cm:.2f", f"over {LOST_CM:g} cm": "share_over_15cm:.1%"},
@@ -46,14 +46,14 @@ COLUMNS = {
 
 
 def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_part"]]:
-    """A part of a mesh, and which of its vertices are left, in their order."""
+    """Return a part of a mesh, and the sorted indices of the vertices that are left."""
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
     centers = shape.verts[shape.faces].mean(axis=1)
     if kind == "cut":
         height = centers @ direction
-        keep = height >= np.quantile(height, 1 - rng.uniform(*_LEFT))
+        keep = height >= np.quantile(height, 1 - rng.uniform(*_KEPT_SHARE))
     else:
         keep = seen_faces(shape, centers, direction)
     used = np.unique(shape.faces[keep])
@@ -61,7 +61,7 @@ def part_of(shape: Shape, kind: Kind, seed: int) -> tuple[Shape, Int[Ints, " V_p
 
 
 def seen_faces(shape: Shape, centers: Float[Floats, "F 3"], direction: Float[Floats, " 3"]) -> Bool[Bools, " F"]:
-    """Whether a camera far away in a direction sees the middle of each face."""
+    """Return whether the center of each face is visible from a distant camera in a direction."""
     facing = normalized(shape.face_vectors) @ direction > 0
     white = face_paint(np.ones((shape.F, 3)))
     scene = Scene([Surface(shape.verts, shape.faces, np.zeros_like(shape.verts), white)])
@@ -80,9 +80,9 @@ def measure(
     work: Path | None,
     asked: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Errors of ``limit`` pairs, evenly spread; every pair counts. ``part`` fits the sources, ``whole`` the targets.
+    """Measure ``limit`` evenly spread pairs. ``part`` fits the sources, ``whole`` the targets.
 
-    Distances are kept in ``cache``, and finished pairs in ``work``, with what was ``asked`` for.
+    Geodesic distances are cached in ``cache``, and finished pairs in ``work`` with the settings ``asked``.
     """
 
     @remembered

@@ -1,8 +1,7 @@
-"""From maps to numbers: every pair counts, whoever made the maps.
+"""Errors of maps on the sets of the benchmark.
 
-Errors are geodesic distances on the target between the predicted and the true vertex. A benchmark asks the same
-question again and again (how far is vertex p of this target from landmark k?), so these distances, which depend on the
-target alone, are computed once and kept on disk.
+Errors are geodesic distances on the target between the predicted and the true vertex. The distances from the landmarks of
+a target to its vertices are the same for all maps, so they are computed once and cached on disk.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from meshmatch.shapes.shape import Shape
 
 READ_BYTES = 64_000_000
 CACHE_VARIABLE = "MESHMATCH_GEODESICS"
-# Part of every file's name: a change of the graph in maps.geodesics must not meet the distances of the old one.
+# Part of every file's name: increase it when the graph in maps.geodesics changes, which invalidates cached distances.
 _GRAPH_VERSION = "1"
 
 
 def default_folder() -> Path:
-    """Where distances are kept: ``$MESHMATCH_GEODESICS``, or ``geodesics`` in the user's cache folder."""
+    """Return the folder of cached distances: ``$MESHMATCH_GEODESICS``, or ``geodesics`` in the user's cache folder."""
     chosen = os.environ.get(CACHE_VARIABLE)
     return Path(chosen) if chosen else platformdirs.user_cache_path("meshmatch") / "geodesics"
 
@@ -48,10 +47,10 @@ class TruthDistances:
     target
         The shape on which errors are measured.
     landmarks
-        Vertex ids ``(N,)`` of its true points.
+        Vertex ids ``(N,)`` of its landmarks.
     folder
-        Where the matrix is kept (`default_folder` for None): ``(unique landmarks, V)`` float16, named by the hashes of
-        shape and landmarks. float16 rounds a distance by at most one part in 2000.
+        Folder of the cached matrix (`default_folder` for None): ``(unique landmarks, V)`` float16, named by the hashes
+        of shape and landmarks. float16 rounds a distance by at most one part in 2000.
     """
 
     def __init__(self, target: Shape, landmarks: Int[Ints, " N"], folder: Path | None) -> None:
@@ -62,7 +61,7 @@ class TruthDistances:
         self.path = Path(folder or default_folder()) / f"{target.hash}-{name}.npy"
 
     def prepare(self) -> None:
-        """Compute and store the matrix unless it is there (1 to 15 ms a row on one core).
+        """Compute and store the matrix unless it exists (1 to 15 ms a row on one core).
 
         Raises
         ------
@@ -86,15 +85,15 @@ class TruthDistances:
             del matrix
 
     def of(self, landmarks: Int[NDArray[np.integer], N]) -> NDArray[np.float16]:
-        """Distances (N, V) from some landmarks, given by their numbers, to all vertices."""
+        """Return distances (N, V) from landmarks, given by their indices, to all vertices."""
         self.prepare()
         matrix = np.load(self.path, mmap_mode="r", allow_pickle=False)
         return np.array(matrix[self.row_of_landmark[landmarks]])
 
     def errors(self, predictions: Sequence[NDArray[np.integer]]) -> list[NDArray[np.float32]]:
-        """Errors ``(N,)`` of each prediction ``(N,)``: the distance from landmark k to vertex ``prediction[k]``.
+        """Return errors ``(N,)`` of each prediction ``(N,)``: the distance from landmark k to vertex ``prediction[k]``.
 
-        The matrix is read once, in order, however many predictions there are: give all those of a target together.
+        The matrix is read once for all predictions, so pass all those of a target together.
         """
         self.prepare()
         matrix = np.load(self.path, mmap_mode="r", allow_pickle=False)
@@ -112,12 +111,12 @@ class TruthDistances:
 
 
 def joined_errors(several: Iterable[Errors]) -> Errors:
-    """All points of several maps together."""
+    """Concatenate the errors of several maps."""
     return Errors(np.concatenate([errors.values for errors in several]))
 
 
 def summary(errors: Sequence[Errors]) -> dict[str, float]:
-    """Errors of pairs in centimeters, unrounded: means and medians over points and over pairs, lost points, flips."""
+    """Summarize the errors of pairs in centimeters: mean and median over points, median over pairs, lost points, flips."""
     joined, means = joined_errors(errors), [each.mean_cm for each in errors]
     return {
         "mean_cm": joined.mean_cm,
@@ -130,14 +129,14 @@ def summary(errors: Sequence[Errors]) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class SetScores:
-    """Errors of all pairs of a set, or of a stated part of it.
+    """Errors of all pairs of a set, or of a subset.
 
     Parameters
     ----------
     errors : dict of pair to Errors
         Errors at all landmarks, for each evaluated pair.
     group : str
-        Which pairs these are, if not all kinds of the set ("same subject").
+        Name of the group of pairs, such as "same subject"; empty for pairs of all groups.
     """
 
     bench: BenchSet
@@ -146,29 +145,29 @@ class SetScores:
 
     @property
     def expected(self) -> int:
-        """Number of pairs that the protocol asks for."""
+        """Number of pairs in the protocol."""
         return sum(1 for pair in self.bench.pairs if self.group in ("", self.bench.group(pair)))
 
     @property
     def means_cm(self) -> dict[Pair, float]:
-        """Mean error of each pair, centimeters, the largest first."""
+        """Mean error of each pair in centimeters, in descending order."""
         means = {pair: errors.mean_cm for pair, errors in self.errors.items()}
         return dict(sorted(means.items(), key=lambda item: -item[1]))
 
     @property
     def joined(self) -> Errors:
-        """All points of all pairs."""
+        """Errors of all points of all pairs."""
         return joined_errors(self.errors.values())
 
     def groups(self) -> list[SetScores]:
-        """The same for each kind of pair, where a set has several."""
+        """Split the scores by group of pairs; empty if the set has no groups."""
         parts: dict[str, dict[Pair, Errors]] = defaultdict(dict)
         for pair, errors in self.errors.items():
             parts[self.bench.group(pair)][pair] = errors
         return [SetScores(self.bench, part, name) for name, part in sorted(parts.items()) if name]
 
     def as_dict(self, worst: int = 10) -> dict[str, Any]:
-        """Plain numbers. The mean over points is the mean over pairs, for every pair has as many points."""
+        """Return a JSON record. All pairs have the same number of points, so the mean over points is that over pairs."""
         digits = {"share_over_15cm": 5, "flips": 5}
         rounded = {
             name: round(value, digits.get(name, 4)) for name, value in summary(list(self.errors.values())).items()
@@ -186,22 +185,22 @@ class SetScores:
 def evaluate_set(
     bench: BenchSet, maps: Mapping[Pair, ArrayLike], *, pairs: Sequence[Pair] | None = None, cache: Path | None = None
 ) -> SetScores:
-    """Errors of maps on a set, at the source's landmarks: geodesic distance on the target, between clouds straight distance
-    in metres.
+    """Compute errors of maps on a set, at the source's landmarks: geodesic on meshes, Euclidean in meters on clouds.
 
     Parameters
     ----------
     maps
         For each pair ``(source, target)`` the index ``(V_src,)``: target vertex of each source vertex.
     pairs
-        Evaluate these only. All pairs of the set, if none are given: a mean that leaves one out is not a mean.
+        The pairs to evaluate; all pairs of the set if None.
     cache
-        Folder of the kept distances; the first run fills it.
+        Folder of cached distances; the first run fills it.
 
     Raises
     ------
     InputError
-        A map is missing, or does not fit its pair: wrong length, or an index outside the target.
+        There are no pairs, a pair is not in the set, or a map is missing, has the wrong length or an index outside the
+        target.
     """
     wanted = list(bench.pairs if pairs is None else pairs)
     if not wanted:
@@ -238,7 +237,10 @@ def evaluate_set(
 
 
 def area_under_curve(score: ArrayLike, right: ArrayLike) -> float:
-    """Chance that a right answer has a higher score than a wrong one (ties count half); nan if one kind lacks."""
+    """Area under the ROC curve: the probability that a right answer has a higher score than a wrong one.
+
+    Ties count half; nan if there are no right or no wrong answers.
+    """
     from scipy.stats import rankdata
 
     values, truth = np.asarray(score, float), np.asarray(right, bool)

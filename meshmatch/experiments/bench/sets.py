@@ -1,19 +1,19 @@
-"""The sets of the benchmark: which shapes, which pairs, and what is true.
+"""The sets of the benchmark: their shapes, pairs and ground truth.
 
 docs/datasets.md says where they come from and how to lay them out; `meshmatch.experiments.bench.datasets` checks a
-folder. In short, *landmark k is the same body point on every shape of a set*, and a set differs from another in how a
-landmark names its vertex:
+folder. In short, *landmark k is the same body point on every shape of a set*; sets differ in how the vertices of landmarks
+are given:
 
 - ``shrec19``: ``N.landmarks.npy`` (6890,) vertex ids; the pairs of ``pairs.txt``.
 - ``scape``: vertex i is landmark i on every shape (the triangulations differ); all ordered pairs.
-- ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, of one subject or of two. Ten
-  consecutive numbers are one subject.
+- ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, in the groups same subject and
+  cross subject. Ten consecutive numbers are one subject.
 
-- ``faust-outliers``: row i of every cloud of ``faust_outliers.npy``, (30, 1000, 3) in metres, many of which are not on the
-  surface; all of them count. There is no mesh, so errors are straight distances.
+- ``faust-outliers``: row i of every cloud of ``faust_outliers.npy``, (30, 1000, 3) in meters. Many points are not on the
+  surface; all of them count. There is no mesh, so errors are Euclidean.
 
-``scape-pcn`` is ``scape`` as the paper's *PC+N*: the method gets the vertices alone, with Gaussian noise of 1 % of the
-bounding box's diagonal; errors are measured on the mesh that they come from.
+``scape-pcn`` is ``scape`` as the paper's *PC+N*: methods get only the vertices, with Gaussian noise of 1 % of the bounding
+box's diagonal; errors are measured on the original mesh.
 
 Several landmarks may share a vertex where a mesh is coarser than the landmarks. All of them count.
 """
@@ -40,12 +40,12 @@ SET_NAMES = ("shrec19", "scape", "faust")
 CLOUD_SET = "scape-pcn"
 OUTLIERS, OUTLIERS_FILE = "faust-outliers", "faust_outliers.npy"
 ALL_SETS = (*SET_NAMES, CLOUD_SET, OUTLIERS)
-NOISE = 0.01  # of the bounding box's diagonal, along each axis
+NOISE = 0.01  # standard deviation along each axis, as a fraction of the bounding box's diagonal
 
 
 @dataclass(frozen=True)
 class BenchSet:
-    """One set of the benchmark: names of shapes and ordered pairs ``(source, target)`` of them."""
+    """A set of the benchmark: names of shapes, and ordered pairs ``(source, target)`` of them."""
 
     name: str
     folder: Path
@@ -53,17 +53,17 @@ class BenchSet:
     pairs: tuple[Pair, ...]
 
     def path(self, shape: str) -> Path:
-        """The file of a shape."""
+        """Return the path of a shape's file."""
         return self.folder / f"{shape}.ply"
 
     def shape(self, shape: str) -> Shape:
-        """The shape as its file has it: every vertex, in the file's order."""
+        """Load a shape with all vertices, in the file's order."""
         if self.name == OUTLIERS:
             return load_clouds(self.folder)[shape]
         return load_shape(self.path(shape))
 
     def seen(self, shape: str) -> Shape:
-        """What a method gets of it: the same, or for ``scape-pcn`` its vertices with noise, seeded by its place."""
+        """Return the shape that methods get: for ``scape-pcn`` the vertices with noise, seeded by the shape's index."""
         whole = self.shape(shape)
         if self.name != CLOUD_SET:
             return whole
@@ -71,13 +71,13 @@ class BenchSet:
         return Shape(whole.verts + NOISE * whole.diagonal * noise, np.empty((0, 3), np.int64), whole.name)
 
     def landmarks(self, shape: str) -> Int[Ints, " N"]:
-        """Vertex id of every landmark; N is the same for every shape of a set."""
+        """Return the vertex ids of the landmarks; N is the same for all shapes of a set."""
         if self.name == OUTLIERS:
             return np.arange(self.shape(shape).V)
         return _landmarks(self.path(shape), self.folder.name == "scape")
 
     def group(self, pair: Pair) -> str:
-        """What kind of pair this is within its set; empty where there is only one kind."""
+        """Return the group of a pair within its set; empty if the set has no groups."""
         if self.name != "faust":
             return ""
         return "same subject" if len({_faust_subject(name) for name in pair}) == 1 else "cross subject"
@@ -91,7 +91,7 @@ def load_set(name: str, data: Path) -> BenchSet:
     OptionError
         There is no set of this name.
     InputError
-        The folder lacks the set, or a file that the pairs name.
+        The folder lacks the set, or a shape named by its pairs.
     """
     if name not in ALL_SETS:
         raise OptionError(f"unknown set '{name}'", f"choose from {', '.join(ALL_SETS)}")
@@ -116,12 +116,12 @@ def load_set(name: str, data: Path) -> BenchSet:
 
 @cache
 def load_clouds(folder: Path) -> dict[str, Shape]:
-    """The clouds with outliers.
+    """Load the clouds with outliers, by name.
 
     Raises
     ------
     InputError
-        The file is missing or holds something else.
+        The file is missing or is not an (N, P, 3) array.
     """
     path = folder / OUTLIERS_FILE
     try:
@@ -156,17 +156,17 @@ def _landmarks(path: Path, every_vertex: bool) -> Int[Ints, " N"]:
 
 
 def ordered_pairs(names: Iterable[str], limit: int | None = None) -> list[Pair]:
-    """All ordered pairs, or so many of them, evenly spread."""
+    """Return all ordered pairs, or ``limit`` of them, evenly spread."""
     return evenly_spread(list(permutations(names, 2)), limit)
 
 
 def load_folder(folder: Path, suffix: str) -> tuple[dict[str, Shape], Mapping[str, Ints]]:
-    """All shapes of a folder and what is true of each (``NAME`` + suffix), by name.
+    """Load all shapes of a folder and the ground truth array of each (``NAME`` + suffix), by name.
 
     Raises
     ------
     InputError
-        The folder is not there, or a shape lacks its truth.
+        The folder is missing, or the ground truth of a shape.
     """
     files = files_in(folder, "*.ply")
     paths = {file.stem: file.with_name(file.stem + suffix) for file in files}

@@ -1,7 +1,7 @@
-"""What weights are worth: shapes posed by a skeleton, and two other ways to weights from the same alignment.
+"""Evaluation of skin weights: posing by linear blend skinning, and two other weight transfer methods as baselines.
 
-Nearest point takes the weights of the closest point of the aligned source. Robust weight inpainting (Abdrashitov et al.
-2023) does so only where that point is near and faces the same way; elsewhere it finds the smoothest weights in between.
+The nearest-point baseline copies the weights of the closest point of the aligned source. Robust weight inpainting
+(Abdrashitov et al. 2023) does so only where that point is near and has a similar normal, and fills in the rest smoothly.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from meshmatch.shapes.formats.gltf_rig import Rig
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import largest_weights
 
-# As the method's authors set them: the distance in diagonals of the bounding box, and the angle in degrees.
-_NEAR, _ANGLE = 0.05, 30.0
-_HELD = 1e-6  # how much parts without a known vertex are held to the nearest point
-_MOVING = ("run", "gallop", "swim")
-# Joints by parts of their names, and degrees about the lateral axis: how a character sits that has no clip.
+# Thresholds of the method's authors: distance as a fraction of the bounding box's diagonal, and angle in degrees.
+_MAX_DISTANCE, _MAX_ANGLE = 0.05, 30.0
+_PULL = 1e-6  # weight of the pull to nearest-point values, which determines parts without known vertices
+_MOTION_CLIPS = ("run", "gallop", "swim")
+# Sitting pose for characters without a clip: substrings of joint names, and rotations about the lateral axis in degrees.
 _SITTING = (("upperleg", -90.0), ("thigh", -90.0), ("lowerleg", 90.0), ("calf", 90.0))
 
 
 def in_motion(rig: Rig) -> Rig:
-    """The skeleton in the middle of the first clip in which it runs or swims, or else sitting; y is up, x lateral."""
-    found = [clip for clip in rig.clips if any(word in clip.name.lower() for word in _MOVING)]
+    """Pose a skeleton in the middle of its first clip of running or swimming, or else sitting; y is up, x lateral."""
+    found = [clip for clip in rig.clips if any(word in clip.name.lower() for word in _MOTION_CLIPS)]
     rotations, translations, scales = rig.rotations.copy(), rig.translations.copy(), rig.scales.copy()
     if found:
         held = {"rotation": rotations, "translation": translations, "scale": scales}
@@ -57,20 +57,20 @@ def _turns(rig: Rig) -> Float[Floats, "N 3 3"]:
 
 
 def skinned(verts: Float[Floats, "V 3"], weights: csr_array, bind: Rig, posed: Rig) -> Float[Floats, "V 3"]:
-    """Vertices that stand as `bind` does, moved by linear blend skinning to how `posed` stands."""
+    """Move vertices from the pose of `bind` to that of `posed` by linear blend skinning."""
     moves = (posed.worlds() @ np.linalg.inv(bind.worlds()))[bind.joints]
     blended = (weights @ moves.reshape(len(moves), 16)).reshape(-1, 4, 4)
     return np.asarray(np.einsum("vij,vj->vi", blended[:, :3, :3], verts) + blended[:, :3, 3])
 
 
 def volume(verts: Float[Floats, "V 3"], shape: Shape) -> float:
-    """What the faces enclose, in the cube of the unit; seen from the middle, where they do not close."""
+    """Compute the volume enclosed by the faces; holes are closed by cones to the mean of the vertices."""
     corners = (verts - verts.mean(axis=0))[shape.faces]
     return float(dot(corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 
 
 def from_bones(verts: Float[Floats, "V 3"], main: Int[Ints, " V"], rig: Rig) -> Float[Floats, " V"]:
-    """How far each vertex is from the bones of its joint (V,), which run to the nodes below it."""
+    """Compute distances (V,) of vertices from the bones of their joints, which run to each joint's children."""
     places, nodes = rig.worlds()[:, :3, 3], rig.joints[main]
     away = np.linalg.norm(verts - places[nodes], axis=1)
     for child, parent in enumerate(rig.parents.tolist()):
@@ -84,18 +84,20 @@ def from_bones(verts: Float[Floats, "V 3"], main: Int[Ints, " V"], rig: Rig) -> 
 def nearest_and_inpainted(
     source: Shape, aligned: Float[Floats, "V_src 3"], weights: csr_array, target: Shape, influences: int = 4
 ) -> tuple[csr_array, csr_array]:
-    """Weights of the target, (V_target, J), by nearest point and by robust weight inpainting.
+    """Transfer weights (V_target, J) by nearest point and by robust weight inpainting.
 
     Parameters
     ----------
     source
-        The shape that has weights.
+        The shape with weights.
     aligned
-        Where its vertices lie on the target.
+        Its vertices, aligned with the target.
     weights
-        (V_source, J) of its joints.
+        Weights of the source, (V_source, J).
     target
-        The shape that has none.
+        The shape without weights.
+    influences
+        Maximum number of joints for each vertex.
     """
     foot = Surface(aligned, source.faces).query(target.verts)
     corners = source.faces[foot.face]
@@ -106,13 +108,13 @@ def nearest_and_inpainted(
     normals = vertex_normals(target.verts, twin[target.faces])[twin]
     there = np.einsum("nk,nkd->nd", foot.barycentric, vertex_normals(aligned, source.faces)[corners])
     size = np.linalg.norm(normals, axis=1) * np.linalg.norm(there, axis=1)
-    alike = dot(normals, there) > np.cos(np.radians(_ANGLE)) * np.maximum(size, 1e-300)
-    known = alike & (foot.distance < _NEAR * np.linalg.norm(np.ptp(target.bounds, axis=0)))
+    alike = dot(normals, there) > np.cos(np.radians(_MAX_ANGLE)) * np.maximum(size, 1e-300)
+    known = alike & (foot.distance < _MAX_DISTANCE * np.linalg.norm(np.ptp(target.bounds, axis=0)))
     return largest_weights(nearest, influences), largest_weights(_inpainted(target, twin, known, nearest), influences)
 
 
 def _inpainted(target: Shape, twin: Ints, known: Bools, values: csr_array) -> csr_array:
-    """Weights of which those known are held, and the others make the energy of the bi-Laplacian least."""
+    """Keep known weights and solve for the others by minimizing the bi-Laplacian energy."""
     first, place = np.unique(twin, return_inverse=True)
     faces = place[target.faces]
     held, dense = known[first], values[first].toarray()
@@ -124,9 +126,9 @@ def _inpainted(target: Shape, twin: Ints, known: Bools, values: csr_array) -> cs
         edges.append(faces[:, [(k + 1) % 3, (k + 2) % 3]])
     matrix = laplacian(np.concatenate(edges), np.clip(np.concatenate(weight), 1e-3, 1e3), len(first))
     area = np.maximum(vertex_areas(target.verts[first], faces), 1e-9 * target.area)
-    energy = csr_array(matrix @ diags_array(target.area / area) @ matrix + diags_array(np.full(len(first), _HELD)))
+    energy = csr_array(matrix @ diags_array(target.area / area) @ matrix + diags_array(np.full(len(first), _PULL)))
     free = np.flatnonzero(~held)
     if len(free):
-        right = _HELD * dense[free] - energy[free][:, np.flatnonzero(held)] @ dense[held]
+        right = _PULL * dense[free] - energy[free][:, np.flatnonzero(held)] @ dense[held]
         dense[free] = splu(energy[free][:, free].tocsc()).solve(right)
     return csr_array(np.maximum(dense, 0.0)[place])

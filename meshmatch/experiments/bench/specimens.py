@@ -1,18 +1,20 @@
-"""Collections of specimens of several kinds, as a laboratory has them, fitted without a model and by other ways.
+"""Collections of biological specimens, and of other shapes, matched without a model and by other methods.
 
-Specimens of a set are turned at random and triangulated each in its own way; of sets with sides every third is a mirror
-image, and of femurs the last two are cut by a plane. Truth: femurs are in correspondence, as are molars, leaves and knees,
-which are generated (`meshmatch.experiments.makers.molars_and_leaves`); hearts share vertices of the mesh that they come
-from; busts and birds have keypoints, the best of their symmetries. Errors are of all ordered pairs, straight in millimetres,
-or along the target in percent of sqrt(area) where there is no unit. A place is lost beyond a tenth of sqrt(area).
+The specimens of a set are rotated at random and remeshed independently. In sets with sides every third one is a mirror
+image, and the last two femurs are cut by a plane. Ground truth: femurs are in correspondence, as are molars, leaves and
+knees, which are generated (`meshmatch.experiments.makers.molars_and_leaves`); hearts share vertices of the mesh that they
+were decimated from; busts and birds have keypoints, up to the symmetries of their class. Errors are over all ordered pairs:
+Euclidean in millimeters, or geodesic in percent of sqrt(area) where there is no unit. A point is lost beyond a tenth of
+sqrt(area).
 
 - none: ``fit FOLDER --model none``.
-- own: ``prepare --grow-radii``, ``train --shapes`` of so many steps, and ``fit FOLDER --model own``, of the same specimens.
-- pairs: ``match A B --model none`` of every pair by itself, or of ``--limit-pairs`` of them.
-- meshmonk: the first specimen is registered to all others, from a start that it is given: the similarity, and the
-  side, that brings true places together best; told as missing where it is not installed.
+- own: ``prepare --grow-radii``, ``train --shapes`` for ``--steps`` steps, and ``fit FOLDER --model own``, all on the same
+  specimens.
+- pairs: ``match A B --model none`` for every pair, or for ``--limit-pairs`` of them.
+- meshmonk: the first uncut specimen is registered to all others. It starts from the similarity, with the right side, that
+  best aligns true points. The output says if it is not installed.
 
-CPU seconds are those of all processes. Kept in ``--work``, a run goes on where it was stopped.
+CPU seconds are those of all processes. With ``--work`` a run resumes where it was stopped.
 """
 
 from __future__ import annotations
@@ -61,10 +63,10 @@ BY_KEYPOINTS = ("bust", "bird", "fish", "chair")
 SETS = (*SIDED, "leaves", *BY_KEYPOINTS)
 PAIRS = "pairs"
 METHODS = (NO_MODEL, "own", PAIRS, "meshmonk")
-_OTHERS = METHODS[3:]
-LOST = 0.1  # of sqrt(area)
-_CUT = 2  # femurs
-_THIN = 10_000  # triangles, for meshmonk
+_OPTIONAL_METHODS = METHODS[3:]
+LOST = 0.1  # error beyond which a point is lost, as a fraction of sqrt(area)
+_N_CUT = 2  # number of femurs that are cut
+_MONK_FACES = 10_000  # triangles of meshes for meshmonk
 _COLUMNS = {"set": "set", "method": "method", "specimens": "specimens:d", "error": "error:.2f", "unit": "unit"}
 _COLUMNS |= {"worst": "worst:.2f", "lost": "lost:.1%", "sides": "sides:.0%", "cut ones": "cut:.2f"}
 _COLUMNS |= {"good": "good:d", "fair": "fair:d", "poor": "poor:d", "CPU s": "cpu:.0f"}
@@ -72,10 +74,10 @@ _COLUMNS |= {"good": "good:d", "fair": "fair:d", "poor": "poor:d", "CPU s": "cpu
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """A shape and its truth.
+    """A shape and its ground truth.
 
-    Places (P, 3) are the same on all of a set, in the coordinates of the shape, nan where it lacks them. Some of its
-    vertices (N,) lie at places with weights: at the corners (N, 3) of a triangle of places.
+    ``places`` (P, 3) are corresponding points of a set in the coordinates of the shape, nan where it lacks them. The N
+    ``vertices`` with known correspondence are at ``weights`` on triangles of places, whose indices are ``corners`` (N, 3).
     """
 
     shape: Shape
@@ -87,22 +89,20 @@ class Specimen:
     cut: bool = False
 
     def seen_on(self, other: Specimen) -> Float[Floats, "N 3"]:
-        """Where its vertices belong on another one; nan where that lacks them."""
+        """Return the true positions of its known vertices on another specimen; nan where that lacks them."""
         return interpolate(other.places, self.corners, self.weights)
 
 
 @dataclass(frozen=True, eq=False)
 class Specimens:
-    """A set; ``folder`` is where keypoints are, of which the best symmetry counts."""
+    """A set of specimens. With ``folder``, the truth is its keypoints, and errors are up to symmetry."""
 
     each: Mapping[str, Specimen]
     unit: str
     folder: Path | None = None
 
     def errors(self, pair: Pair, points: Float[Floats, "N 3"]) -> Float[Floats, " N"]:
-        """How far off a source's vertices are, in the unit, given where they arrive on the target; nan where that lacks
-        them.
-        """
+        """Compute errors, in the unit, of the mapped points of the source's known vertices; nan without a true point."""
         source, target = (self.each[name] for name in pair)
         if self.folder is None:
             return np.asarray(np.linalg.norm(points - source.seen_on(target), axis=1))
@@ -112,23 +112,23 @@ class Specimens:
         return np.asarray(min(ways, key=np.mean))
 
     def lost(self, name: str) -> float:
-        """How far off a place of this target is lost, in the unit."""
+        """Return the error, in the unit, beyond which a point of this target is lost."""
         return 100 * LOST if self.folder is not None else LOST * float(np.sqrt(self.each[name].shape.area))
 
 
-def turned(rng: np.random.Generator, mirror: bool, far: float) -> Frame:
-    """A motion at random; with a reflection where asked for."""
+def random_motion(rng: np.random.Generator, mirror: bool, far: float) -> Frame:
+    """Draw a random rigid motion, with a reflection if ``mirror``; ``far`` bounds the translation along each axis."""
     turn = Rotation.random(rng=rng).as_matrix()
     return Frame(1.0, turn @ np.diag([-1.0, 1, 1]) if mirror else turn, rng.uniform(-far, far, 3))
 
 
 def moved(shape: Shape, frame: Frame) -> Shape:
-    """A shape elsewhere, facing out."""
+    """Transform a shape; reflections reverse its faces, which keeps normals outward."""
     return Shape(frame.apply(shape.verts), shape.faces[:, ::-1] if frame.mirrored else shape.faces, shape.name)
 
 
 def scanned(whole: Shape, rng: np.random.Generator, mirror: bool, cut: bool) -> Specimen:
-    """A shape of a set in correspondence as a scanner has it: in triangles of its own, perhaps without one end."""
+    """Make a specimen from a shape in correspondence: remeshed, moved at random, and without one end if ``cut``."""
     shape, places = decimate(whole, int(whole.F * rng.uniform(0.5, 0.8))), np.array(whole.verts)
     if cut:
         long = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)[2][0]
@@ -142,7 +142,7 @@ def scanned(whole: Shape, rng: np.random.Generator, mirror: bool, cut: bool) -> 
     foot = Surface(whole.verts / unit, whole.faces, whole.vertex_normals).query(
         shape.verts / unit, shape.vertex_normals
     )
-    frame = turned(rng, mirror, unit)
+    frame = random_motion(rng, mirror, unit)
     at = np.arange(shape.V)
     return Specimen(moved(shape, frame), frame.apply(places), at, whole.faces[foot.face], foot.barycentric, mirror, cut)
 
@@ -150,9 +150,9 @@ def scanned(whole: Shape, rng: np.random.Generator, mirror: bool, cut: bool) -> 
 def by_points(
     shape: Shape, points: Int[Ints, " P"], count: int, rng: np.random.Generator, mirror: bool = False
 ) -> Specimen:
-    """A shape of which some vertices are known: ``points`` are the vertices of places, -1 where it lacks one."""
+    """Make a specimen from a shape with known vertices: ``points`` has the vertex of each place, or -1."""
     known = np.flatnonzero(points >= 0)
-    shape = moved(shape, turned(rng, mirror, float(np.sqrt(shape.area))))
+    shape = moved(shape, random_motion(rng, mirror, float(np.sqrt(shape.area))))
     places = np.full((count, 3), np.nan)
     places[known] = shape.verts[points[known]]
     return Specimen(
@@ -161,7 +161,7 @@ def by_points(
 
 
 def wholes(name: str, data: Path, count: int, seed: int) -> dict[str, Shape]:
-    """The shapes of a set in correspondence: femurs, or what is generated."""
+    """Return the shapes of a set in correspondence: femurs from files, others generated."""
     if name == "femurs":
         files = runner.evenly_spread(runner.files_in(data / "femur", "*.ply"), count)
         return {path.stem: load_shape(path) for path in files}
@@ -170,7 +170,7 @@ def wholes(name: str, data: Path, count: int, seed: int) -> dict[str, Shape]:
 
 
 def load(name: str, data: Path, count: int, seed: int) -> Specimens:
-    """A set of so many specimens, if it has as many."""
+    """Load or generate a set of ``count`` specimens, or fewer if it has fewer."""
     rng = np.random.default_rng([seed, SETS.index(name)])
     mirrored = [name in SIDED and k % 3 == 2 for k in range(max(count, 100))]
     if name in BY_KEYPOINTS:
@@ -193,19 +193,18 @@ def load(name: str, data: Path, count: int, seed: int) -> Specimens:
             made[each] = by_points(shapes_of[each], at, size, rng, mirrored[number])
         return Specimens(made, "mm")
     shapes = wholes(name, data, count, seed)
-    cut = [name == "femurs" and k >= len(shapes) - _CUT for k in range(len(shapes))]
+    cut = [name == "femurs" and k >= len(shapes) - _N_CUT for k in range(len(shapes))]
     each_how = zip(shapes.items(), mirrored, cut, strict=False)
     return Specimens({key: scanned(shape, rng, *how) for (key, shape), *how in each_how}, "mm")
 
 
 Points = Callable[[Pair], Floats]
-"""Where the vertices of a source that are asked for arrive on a target."""
+"""Function from a pair to the mapped points (N, 3), on the target, of the source's known vertices."""
 
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """What a method makes of a set: where vertices arrive, and what is said of each fit of a collection, or of each pair:
-    the verdict, and whether sides were told rightly."""
+    """Result of a method on a set: mapped points, and records of a collection's fits or, by pair, verdict and right side."""
 
     points: Points
     records: Sequence[Record] = ()
@@ -213,7 +212,7 @@ class Done:
 
 
 def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Done:
-    """``meshmatch fit SCANS -o FITS --model MODEL``."""
+    """Fit a collection by ``meshmatch fit SCANS -o FITS --model MODEL``."""
     collection = Collection(work, workers=1)
     records = collection.fit(scans, model=model).records
 
@@ -227,7 +226,7 @@ def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Do
 
 
 def own(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
-    """A model of the specimens' own."""
+    """Train a model on the specimens and fit them with it."""
     prepare(scans, work / "prepared", PrepareConfig(NodeConfig("geodesic", grow=True)))
     recipe = recipe_for(work / "prepared").changed(steps=steps)
     train(work / "model", shapes=work / "prepared", recipe=recipe)
@@ -235,7 +234,7 @@ def own(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
 
 
 def by_pairs(some: Specimens, scans: Path, work: Path) -> Done:
-    """``meshmatch match A B --model none``."""
+    """Match each pair by ``meshmatch match A B --model none``."""
     matcher = Matcher(NO_MODEL, threads=1)
     files = {name: load_shape(scans / f"{name}.ply") for name in some.each}
     judged: list[tuple[str, bool]] = []
@@ -252,7 +251,7 @@ def by_pairs(some: Specimens, scans: Path, work: Path) -> Done:
 
 
 def start_of(first: Specimen, other: Specimen) -> Frame:
-    """The similarity, with its reflection, that brings the places of one specimen to those of another."""
+    """Find the similarity, reflected if sides differ, that best aligns the places of one specimen with another's."""
     both = np.isfinite(first.places).all(axis=1) & np.isfinite(other.places).all(axis=1)
     a, b = first.places[both], other.places[both]
     centers = a.mean(axis=0), b.mean(axis=0)
@@ -264,17 +263,17 @@ def start_of(first: Specimen, other: Specimen) -> Frame:
     return Frame(1 / larger, turn, centers[0] - centers[1] @ turn / larger)
 
 
-def monk(some: Specimens, scans: Path, work: Path) -> Done:
-    """The first specimen that is not cut, registered by meshmonk to all others."""
+def by_meshmonk(some: Specimens, scans: Path, work: Path) -> Done:
+    """Register the first uncut specimen to all others by meshmonk."""
     first = next(each for each in some.each.values() if not each.cut)
-    base, area = decimate(first.shape, _THIN), float(np.sqrt(first.shape.area))
+    base, area = decimate(first.shape, _MONK_FACES), float(np.sqrt(first.shape.area))
     on, units = {}, {}
     for name, other in some.each.items():
         start = start_of(first, other)
         begun, unit = moved(base, start), area / start.scale
         meshes = [
             (each.verts / unit, each.vertex_normals, np.asarray(each.faces))
-            for each in (begun, decimate(other.shape, _THIN))
+            for each in (begun, decimate(other.shape, _MONK_FACES))
         ]
         on[name], units[name] = viscoelastic(*meshes) * unit, unit
 
@@ -290,13 +289,13 @@ def monk(some: Specimens, scans: Path, work: Path) -> Done:
     return Done(points)
 
 
-def _cpu() -> float:
-    """Seconds of CPU, those of processes that have ended with them."""
+def _cpu_seconds() -> float:
+    """CPU seconds of this process and of its children that have ended."""
     return sum(os.times()[:4])
 
 
 def sides_found(some: Specimens, done: Done) -> float | None:
-    """Share of specimens whose side is told rightly, whichever side the template is of; or of pairs."""
+    """Share of specimens, or of pairs, whose side is found; the side of the template does not matter."""
     if not any(each.mirrored for each in some.each.values()):
         return None
     if done.pairs:
@@ -309,7 +308,7 @@ def sides_found(some: Specimens, done: Done) -> float | None:
 def measure(
     name: str, method: str, data: Path, count: int, steps: int, limit: int | None, seed: int, work: Path
 ) -> dict[str, Any]:
-    """A row."""
+    """Run a method on a set and return its table row."""
     some = load(name, data, count, seed)
     scans, place = work / "scans" / name, work / "fits" / f"{name}-{method}"
     make_folder(scans)
@@ -317,20 +316,20 @@ def measure(
         save_shape(scans / f"{key}.ply", each.shape)
     exact = {key: load_shape(scans / f"{key}.ply").verts - each.shape.verts for key, each in some.each.items()}
     assert max(float(np.abs(off).max()) for off in exact.values()) < 1e-3
-    began = _cpu()
+    began = _cpu_seconds()
     ways: dict[str, Callable[[Specimens, Path, Path], Done]] = {
         NO_MODEL: partial(collected, model=NO_MODEL),
         "own": partial(own, steps=steps),
         PAIRS: by_pairs,
-        "meshmonk": monk,
+        "meshmonk": by_meshmonk,
     }
     done = ways[method](some, scans, place)
-    cpu = _cpu() - began
+    cpu = _cpu_seconds() - began
     means, lost, on_cut = {}, [], []
     for pair in runner.evenly_spread(list(permutations(some.each, 2)), limit if method == PAIRS else None):
-        began = _cpu()
+        began = _cpu_seconds()
         arrived = done.points(pair)
-        cpu += _cpu() - began
+        cpu += _cpu_seconds() - began
         errors = some.errors(pair, arrived)
         errors = errors[np.isfinite(errors)]
         means[pair] = float(errors.mean())
@@ -355,14 +354,14 @@ def main(
     sets: Annotated[str, Option(help=f"of {', '.join(SETS)}")] = ",".join(SETS),
     methods: Annotated[str, Option(help=f"of {', '.join(METHODS)}")] = ",".join(METHODS),
     count: Annotated[int, Option(min=3, help="specimens of each set, if it has as many")] = 9,
-    steps: Annotated[int, Option(min=1, help="that own models are trained for")] = 200,
+    steps: Annotated[int, Option(min=1, help="training steps of own models")] = 200,
     limit_pairs: runner.LimitPairs = None,
     work: runner.Work = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
     names, rows = runner.split_names(sets, SETS, "set"), []
-    chosen, skipped = runner.installed(runner.split_names(methods, METHODS, "method"), _OTHERS)
+    chosen, skipped = runner.installed(runner.split_names(methods, METHODS, "method"), _OPTIONAL_METHODS)
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
         for method in chosen:

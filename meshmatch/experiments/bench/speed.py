@@ -1,12 +1,11 @@
 """Time and memory of whole processes.
 
-Each case is a command as a user types it, in a process of its own, from the interpreter's start to its end: nothing is
-warm but the disk's cache. Shown is the median of several runs after one that does not count: seconds on the clock,
-seconds of CPU (both cores together), and the largest memory that a run ever held. Bars are for two cores, and all
-processes are kept on two where the system allows that. The shapes are the two samples, split and decimated to the sizes
-that the cases ask for.
+Each case is a command line in a new process, measured from the interpreter's start to its end: only the disk's cache is
+warm. The table has medians of several runs after a warm-up: wall time, CPU time of all cores, and peak memory. Bars are for
+two cores; all processes are bound to two where the system allows it. The shapes are the two samples, subdivided and
+decimated to the sizes of the cases.
 
-``--against`` puts an earlier run beside this one: the file that it wrote with --save, such as docs/results/speed.json.
+``--against`` compares with an earlier run: a file that it wrote with --save, such as docs/results/speed.json.
 """
 
 from __future__ import annotations
@@ -42,17 +41,17 @@ from meshmatch.templates.location import bundled_folder
 
 @dataclass(frozen=True)
 class Case:
-    """A command and what it may cost.
+    """A command and its limits of time and memory.
 
     Parameters
     ----------
     words : tuple of str
-        What follows ``python -m meshmatch``; a word ``NAME@V`` stands for the file of the sample NAME brought to at
-        least V vertices, ``NAME@V+CHANGE`` for one that was also changed (`CHANGES`), ``NAME.glb`` for that sample, ``A>B``
-        for a map between two such words, ``A~B`` for a truth that differs from it (`truth_beside`), ``@FILE`` for a file
-        to write. What a case reads is made before it is measured.
+        Arguments of ``python -m meshmatch``. A word ``NAME@V`` stands for the sample NAME with at least V vertices,
+        ``NAME@V+CHANGE`` for such a sample after a change of `CHANGES`, ``NAME.glb`` for that sample, ``A>B`` for a map
+        between two such words, ``A~B`` for ground truth near it (`truth_beside`), ``@FILE`` for an output file. Inputs are
+        made before the case is measured.
     seconds, gigabytes : float
-        The bars; nothing is asked of memory where it is 0.
+        The limits; 0 gigabytes is no limit.
     """
 
     words: tuple[str, ...]
@@ -66,7 +65,7 @@ def _baking(size: int) -> tuple[str, ...]:
     return ("transfer-texture", "dancer-textured.glb", target, "-o", "@dressed.glb", *known, "--size", str(size))
 
 
-_EVALUATED = "dancer@60000", "climber@60000"
+_EVALUATED_PAIR = "dancer@60000", "climber@60000"
 CASES = {
     "help": Case(("--help",), 0.1),
     "pair": Case(("match", "climber@10000", "dancer@10000", "-o", "@map.npy"), 3.0, 0.5),
@@ -78,7 +77,9 @@ CASES = {
     "direct": Case(("match", "climber@10000", "dancer@10000", "--model", "none", "-o", "@map.npy"), 8.0, 1.0),
     "large direct": Case(("match", "climber@100000", "dancer@100000", "--model", "none", "-o", "@map.npy"), 20.0),
     "loose direct": Case(("match", "dancer@100000+loose", "climber@10000", "--model", "none", "-o", "@map.npy"), 60.0),
-    "evaluate": Case(("evaluate", ">".join(_EVALUATED), *_EVALUATED, "--truth", "~".join(_EVALUATED)), 10.0),
+    "evaluate": Case(
+        ("evaluate", ">".join(_EVALUATED_PAIR), *_EVALUATED_PAIR, "--truth", "~".join(_EVALUATED_PAIR)), 10.0
+    ),
     "texture 2048": Case(_baking(2048), 4.0),
     "texture 8192": Case(_baking(8192), 25.0, 1.5),
 }
@@ -86,7 +87,7 @@ CASES = {
 
 @dataclass(frozen=True)
 class Cost:
-    """What one process took: seconds on the clock, seconds of CPU, gigabytes at its largest."""
+    """Cost of one process: wall seconds, CPU seconds, and peak memory in gigabytes."""
 
     wall: float
     cpu: float
@@ -94,35 +95,34 @@ class Cost:
 
 
 def cost_of(command: Sequence[str]) -> Cost:
-    """Run a command to its end and read what the kernel counted.
+    """Run a command to its end and return the kernel's resource usage.
 
-    Memory is never less than what this process itself holds, for a child begins as its copy. Compiled modules are kept
-    for the next run, as they are by an installation, and memory is given back as nobody's settings say, whatever the
-    environment has.
+    Memory is at least that of this process, as the child is forked from it. Bytecode is cached, as in an installation, and
+    the allocator has its default settings: environment variables that change either are not passed on.
 
     Raises
     ------
     MeshmatchError
-        It did not end with status 0; the message is its last line of stderr.
+        The status is not 0; the message has the last line of stderr.
     """
     own = ("PYTHONDONTWRITEBYTECODE", "MALLOC_")
     environment = {name: value for name, value in os.environ.items() if not name.startswith(own)}
-    with tempfile.TemporaryFile() as told:
+    with tempfile.TemporaryFile() as stderr:
         started = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=told, env=environment)
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, env=environment)
         _, status, usage = os.wait4(process.pid, 0)
         wall = time.perf_counter() - started
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
-            told.seek(0)
-            lines = told.read().decode(errors="replace").strip().splitlines() or ["it said nothing"]
+            stderr.seek(0)
+            lines = stderr.read().decode(errors="replace").strip().splitlines() or ["no message"]
             raise MeshmatchError(f"{' '.join(command)} ended with {process.returncode}: {lines[-1]}")
-    unit = 1.0 if sys.platform == "darwin" else 1024.0  # of ru_maxrss, in bytes
+    unit = 1.0 if sys.platform == "darwin" else 1024.0  # bytes per unit of ru_maxrss
     return Cost(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * unit / 1e9)
 
 
 def split(shape: Shape) -> Shape:
-    """Every triangle in four, in an order that decimation leaves closed (trimesh's is not)."""
+    """Split every triangle into four, in an order that decimation keeps closed (trimesh's is not)."""
     corners = shape.faces
     keys, place = np.unique(edge_keys(corners, shape.V), return_inverse=True)
     middles = 0.5 * (shape.verts[keys // shape.V] + shape.verts[keys % shape.V])
@@ -134,20 +134,20 @@ def split(shape: Shape) -> Shape:
 
 
 def sized(shape: Shape, V: int) -> Shape:
-    """A closed shape split until it has at least V vertices; a small one is then decimated to about V."""
+    """Split a closed shape until it has at least V vertices; below 200,000 vertices it is then decimated to about V."""
     while shape.V < V:
         shape = split(shape)
     return decimate(shape, 2 * V) if 1.1 * V < shape.V < 200_000 else shape
 
 
 def noisy(shape: Shape) -> Shape:
-    """The vertices alone, with Gaussian noise of 1 % of the diagonal."""
+    """Return the vertices as a cloud, with Gaussian noise of 1 % of the diagonal."""
     noise = np.random.default_rng(0).standard_normal(shape.verts.shape)
     return Shape(shape.verts + 0.01 * shape.diagonal * noise, np.empty((0, 3), np.int64), shape.name)
 
 
 def upper_half(shape: Shape) -> Shape:
-    """What lies above the middle of a shape whose y axis points up."""
+    """Return the faces above half the height; y is up."""
     heights = shape.verts[:, 1]
     faces = shape.faces[(heights[shape.faces] > 0.5 * (heights.min() + heights.max())).all(1)]
     used = np.unique(faces)
@@ -155,7 +155,7 @@ def upper_half(shape: Shape) -> Shape:
 
 
 def loose(shape: Shape) -> Shape:
-    """Every triangle alone, a little smaller than it was, so that none touches another."""
+    """Separate all triangles and shrink them a little, so that none touches another."""
     corners = shape.verts[shape.faces]
     corners = corners + 0.01 * (corners.mean(1, keepdims=True) - corners)
     return Shape(corners.reshape(-1, 3), np.arange(3 * shape.F).reshape(-1, 3), shape.name)
@@ -170,7 +170,7 @@ CHANGES: dict[str, Callable[[Shape], Shape]] = {
 
 
 def truth_beside(found: VertexMap, target: Shape) -> Ints:
-    """The vertices (V_src,) of the target beside the images of a map: 1 % of sqrt(area) from them along each axis."""
+    """Return target vertices (V_src,) nearest to the images of a map plus Gaussian noise of 1 % of sqrt(area) per axis."""
     noise = 0.01 * np.sqrt(target.area) * np.random.default_rng(0).standard_normal((len(found.index), 3))
     return np.asarray(cKDTree(target.verts).query(target.verts[found.index] + noise)[1], np.int64)
 
@@ -189,7 +189,10 @@ def _write(word: str, path: Path, made: list[Path]) -> None:
 
 
 def file_of(word: str, folder: Path) -> Path:
-    """The file of a word of a case, made once, by a process of its own: a child's memory is counted from its parent's."""
+    """Return the file of a word of a case, made once.
+
+    A new process makes it, as this process's memory would count in that of measured children.
+    """
     if word.endswith(".glb"):
         return bundled_folder() / "samples" / word
     both = word.replace("~", ">").split(">")
@@ -208,7 +211,7 @@ def file_of(word: str, folder: Path) -> Path:
 
 
 def measure(case: Case, runs: int, folder: Path) -> list[Cost]:
-    """Costs of `runs` runs after one that is not counted."""
+    """Measure the costs of `runs` runs after a warm-up run."""
     command = [sys.executable, "-m", "meshmatch"]
     for word in case.words:
         if word.startswith("@"):
@@ -219,7 +222,7 @@ def measure(case: Case, runs: int, folder: Path) -> list[Cost]:
 
 
 def keep_to_cores(count: int) -> int:
-    """Keep this process and its children on `count` cores; returns on how many they are."""
+    """Bind this process and its children to `count` cores; return the number of cores that they can use."""
     if not hasattr(os, "sched_setaffinity"):
         return os.cpu_count() or 1
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
@@ -227,7 +230,7 @@ def keep_to_cores(count: int) -> int:
 
 
 def record_of(name: str, case: Case, costs: list[Cost]) -> dict[str, Any]:
-    """A case's row: medians, bars, whether they are met, every run."""
+    """Return a case's row: medians, limits, whether they are met, and every run."""
     middle = Cost(*(statistics.median(values) for values in zip(*(asdict(c).values() for c in costs), strict=True)))
     return {
         "case": name,
@@ -245,12 +248,12 @@ COLUMNS = {
 }
 
 
-AGAINST = {"s before": "wall_before:.2f", "CPU s before": "cpu_before:.2f", "GB before": "gigabytes_before:.2f"}
-RATIOS = {"s, ratio": "wall_ratio:.2f", "CPU, ratio": "cpu_ratio:.2f", "GB, ratio": "gigabytes_ratio:.2f"}
+BEFORE_COLUMNS = {"s before": "wall_before:.2f", "CPU s before": "cpu_before:.2f", "GB before": "gigabytes_before:.2f"}
+RATIO_COLUMNS = {"s, ratio": "wall_ratio:.2f", "CPU, ratio": "cpu_ratio:.2f", "GB, ratio": "gigabytes_ratio:.2f"}
 
 
 def earlier(path: Path) -> dict[str, dict[str, Any]]:
-    """The rows of an earlier run by the name of their case; `InputError` if the file does not hold one."""
+    """Read the rows of an earlier run by case name; `InputError` if the file does not contain one."""
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))["values"]["cases"]
         return {row["case"]: {name: float(row[name]) for name in ("wall", "cpu", "gigabytes")} for row in rows}
@@ -259,7 +262,7 @@ def earlier(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def compared(row: dict[str, Any], before: dict[str, float]) -> dict[str, Any]:
-    """A row with the numbers of an earlier one, and how many times as much it takes."""
+    """Add the numbers of an earlier row to a row, and the ratios to them."""
     return (
         row
         | {f"{name}_before": value for name, value in before.items()}
@@ -272,7 +275,7 @@ def main(
     cases: Annotated[str, Option(help=f"of {', '.join(CASES)}")] = ",".join(CASES),
     runs: Annotated[int, Option(min=1, help="counted runs of each case")] = 5,
     cores: Annotated[int, Option(min=1, help="cores that all processes share")] = 2,
-    against: Annotated[Path | None, Option(help="a file of results of an earlier run")] = None,
+    against: Annotated[Path | None, Option(help="saved results of an earlier run to compare with")] = None,
 ) -> runner.Report:
     before = {} if against is None else earlier(against)
     kept = keep_to_cores(cores)
@@ -282,5 +285,5 @@ def main(
             for name in runner.track(runner.split_names(cases, CASES, "case"), "running")
         ]
     title = f"Whole processes on {kept} cores, median of {runs} runs"
-    columns = COLUMNS if against is None else {**COLUMNS, **AGAINST, **RATIOS}
+    columns = COLUMNS if against is None else {**COLUMNS, **BEFORE_COLUMNS, **RATIO_COLUMNS}
     return runner.Report({"kept_to_cores": kept, "cases": rows}, [runner.table(title, rows, columns)])

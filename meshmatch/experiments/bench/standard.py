@@ -1,20 +1,20 @@
-"""The published splits of remeshed people and animals, for those who have the data: table 1 of most papers.
+"""The standard test splits of remeshed people and animals, as reported by most papers; the data must be obtained.
 
-Folders are laid out as others keep them, ``FAUST_r/off/*.off`` and ``FAUST_r/corres/*.vts``: line k of a shape's list is the
-vertex, counted from 1, of the point k that all shapes of the set have.
+Folders have the usual layout, ``FAUST_r/off/*.off`` and ``FAUST_r/corres/*.vts``: line k of a shape's list is the vertex,
+counted from 1, of point k, which all shapes of the set share.
 
 - FAUST_r: the last 20 shapes (tr_reg_080 to 099); SCAPE_r: the last 20 (mesh052 to 071).
-- SHREC19_r: the pairs of ``corres/I_J.map`` without shape 40, which is a part: from J to I, as others measure; line k is the
-  vertex of J for vertex k of I.
-- SMAL_r: those that ``test_cat.txt`` names.
+- SHREC19_r: the pairs of ``corres/I_J.map`` without shape 40, which is partial: from J to I, as usual; line k is the vertex
+  of J for vertex k of I.
+- SMAL_r: the shapes listed in ``test_cat.txt``.
 - TOPKIDS: every shape to the first, kid00; line k of ``corres/NAME_ref.vts`` is the vertex of kid00 for vertex k.
-- iso, qes, mc, dense, cloud: the last 20 shapes of FAUST, remeshed or sampled in five ways to measure what triangles change
-  (Sharp et al. 2021), each to FAUST's first, ``discretization/tr_reg_000.ply``; line k of
-  ``discretization/iso/tr_reg_iso_080.txt`` is its vertex, counted from 0, for vertex k of the ply beside it.
+- iso, qes, mc, dense, cloud: the last 20 shapes of FAUST, remeshed or sampled in five ways to measure the effect of
+  discretization (Sharp et al. 2021), each to FAUST's first, ``discretization/tr_reg_000.ply``; line k of
+  ``discretization/iso/tr_reg_iso_080.txt`` is its vertex, counted from 0, for vertex k of the ply of the same name.
 
-Of other sets all ordered pairs of different shapes count, none left out. The error is the geodesic distance on the target
-between the matched and the true vertex, in units of sqrt(area), times 100: the mean over points, then over pairs. Intervals
-are of 95 %, by drawing shapes with replacement. No shape of any of these sets was used to train a model that ships.
+In the other sets all ordered pairs of different shapes count. The error is the geodesic distance on the target between the
+matched and the true vertex, in units of sqrt(area), times 100: the mean over points, then over pairs. Confidence intervals
+are 95 %, by bootstrap over shapes. No shape of these sets was used to train the models that are shipped.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ MODELS = {"FAUST_r": "human", "SCAPE_r": "human", "SHREC19_r": "human", "SMAL_r"
 MODELS |= dict.fromkeys(REMESHED, "human")
 _REFERENCES = {"TOPKIDS": "kid00"} | dict.fromkeys(REMESHED, "tr_reg_000")
 _TEST = {"FAUST_r": range(80, 100), "SCAPE_r": range(52, 72)}  # numbers of the shapes
-_PART, _NAMES, _REMESHED = "40", "test_cat.txt", "discretization"
-_DRAWS = 2000
+_PARTIAL_SHAPE, _TEST_LIST, _REMESHED = "40", "test_cat.txt", "discretization"
+_N_RESAMPLES = 2000
 _COLUMNS = {
     "set": "set",
     "model": "model",
@@ -66,8 +66,15 @@ _COLUMNS |= {
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Shapes and pairs of a set, and its truth: ``points`` of every shape (N,); vertices (V,) of the ``reference`` to which
-    all pairs lead, if there is one; or ``partners`` (V,) in the source of each pair, for all vertices of its target.
+    """Shapes, pairs and ground truth of a split.
+
+    Parameters
+    ----------
+    shapes, pairs : shapes by name, and ordered pairs of names
+    points : for each shape, the vertices (N,) of corresponding points; with a reference, the reference's vertex for each
+        vertex
+    reference : the shape that is the target of all pairs; empty if there is none
+    partners : for each pair, the source's vertex (V,) for each vertex of the target; empty if ``points`` is the truth
     """
 
     shapes: Shapes
@@ -77,22 +84,22 @@ class Split:
     partners: Mapping[Pair, Int[Ints, " V"]] = field(default_factory=dict)
 
     def asked(self, pair: Pair) -> Int[Ints, " N"]:
-        """Vertices of the source whose partners are known: of all pairs with this target those of `known`, in order."""
+        """Return the source's vertices whose true partners are ``known(target)``, in the same order."""
         return self.partners[pair] if self.partners else self.points[pair[0]]
 
     def known(self, target: str) -> Int[Ints, " N"]:
-        """The true vertices of a target."""
+        """Return the vertices of a target that are true partners."""
         everywhere = self.partners or target == self.reference
         return np.arange(self.shapes[target].V) if everywhere else self.points[target]
 
 
 def split_of(name: str, data: Path) -> Split:
-    """A published split.
+    """Load a published split.
 
     Raises
     ------
     InputError
-        The folder or a list is missing, or a list does not fit its shape.
+        The folder or a list is missing, or a list does not match its shape.
     """
     reference = _REFERENCES.get(name, "")
     if name in REMESHED:
@@ -105,13 +112,13 @@ def split_of(name: str, data: Path) -> Split:
     else:
         folder = data / name
         files = {path.stem: path for path in sorted(runner.files_in(folder / "off", "*.off"), key=_number)}
-        names = _chosen(name, folder, list(files))
+        names = _names_in_split(name, folder, list(files))
         lists = {each: (folder / "corres" / f"{each}{'_ref' if reference else ''}.vts", 1) for each in names}
     if missing := [each for each in names if each not in files]:
         raise InputError(f"{folder / 'off'} has no {missing[0]}.off")
     shapes = {each: load_shape(files[each]) for each in names}
     if name == "SHREC19_r":
-        return _by_pairs(shapes, folder / "corres")
+        return _load_pair_maps(shapes, folder / "corres")
     points = {}
     for each in names:
         if each == reference:
@@ -129,12 +136,12 @@ def split_of(name: str, data: Path) -> Split:
     return Split(shapes, list(permutations(names, 2)), points)
 
 
-def _by_pairs(shapes: Shapes, folder: Path) -> Split:
-    """The pairs that a folder has files ``I_J.map`` of, from J to I, without the part."""
+def _load_pair_maps(shapes: Shapes, folder: Path) -> Split:
+    """Load the pairs of a folder's files ``I_J.map``, from J to I, without the partial shape."""
     partners: dict[Pair, Int[Ints, " V"]] = {}
     for path in runner.files_in(folder, "*.map"):
         target, _, source = path.stem.partition("_")
-        if _PART in (source, target):
+        if _PARTIAL_SHAPE in (source, target):
             continue
         if missing := [each for each in (source, target) if each not in shapes]:
             raise InputError(f"{path.name} is of a shape that is not there: {missing[0] or 'its name is no pair'}")
@@ -146,26 +153,28 @@ def _by_pairs(shapes: Shapes, folder: Path) -> Split:
 
 
 def _number(path: Path) -> tuple[int, str]:
-    """The order of files by the digits in their names."""
+    """Sort key: the digits of a file's name as a number, then the name."""
     digits = "".join(letter for letter in path.stem if letter.isdigit())
     return int(digits or 0), path.stem
 
 
-def _chosen(name: str, folder: Path, names: list[str]) -> list[str]:
+def _names_in_split(name: str, folder: Path, names: list[str]) -> list[str]:
     if name in _TEST:
         return names[-len(_TEST[name]) :]
     if name == "SHREC19_r":
-        return [each for each in names if each != _PART]
+        return [each for each in names if each != _PARTIAL_SHAPE]
     if name == "TOPKIDS":
         return [_REFERENCES[name], *(each for each in names if each != _REFERENCES[name])]
     try:
-        return (folder / _NAMES).read_text("utf-8").split()
+        return (folder / _TEST_LIST).read_text("utf-8").split()
     except OSError as error:
-        raise InputError(f"{folder} has no {_NAMES}", "it names the shapes of the test split, one a line") from error
+        raise InputError(
+            f"{folder} has no {_TEST_LIST}", "it names the shapes of the test split, one a line"
+        ) from error
 
 
 def not_published(name: str, shapes: Sequence[str]) -> str:
-    """What is to be said where these are not the test shapes of a set, as in a folder that lacks some."""
+    """Return a warning if these are not the published test shapes of a set; empty if they are."""
     numbers = _TEST.get(name, ())
     if not numbers or [_number(Path(each))[0] for each in shapes] == list(numbers):
         return ""
@@ -174,7 +183,7 @@ def not_published(name: str, shapes: Sequence[str]) -> str:
 
 
 def vertices_in(path: Path, first: int) -> Int[Ints, " N"]:
-    """A list of vertices, one a line, counted from ``first`` there, and from 0 here."""
+    """Read vertex ids, one per line, counted from ``first`` in the file; return them counted from 0."""
     try:
         found = np.loadtxt(path, ndmin=1)
     except (OSError, ValueError) as error:
@@ -185,7 +194,7 @@ def vertices_in(path: Path, first: int) -> Int[Ints, " N"]:
 
 
 def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path | None) -> dict[Pair, Floats]:
-    """Errors at all points of every pair, times 100."""
+    """Compute errors at all points of every pair, in units of sqrt(area), times 100."""
     found: dict[Pair, Floats] = {}
     for target in runner.track(sorted({pair[1] for pair in indices}), "measuring"):
         mine = [pair for pair in indices if pair[1] == target]
@@ -202,14 +211,14 @@ def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path
 
 
 def interval_over_shapes(means: Mapping[Pair, float], seed: int = 0) -> tuple[float, float]:
-    """Of 95 %, of the mean over pairs, if shapes were drawn again with replacement."""
+    """Compute the 95 % bootstrap interval, over shapes, of the mean over pairs."""
     names = sorted({name for pair in means for name in pair})
     a, b = np.array([[names.index(name) for name in pair] for pair in means]).T
     values = np.array(list(means.values()))
     rng, drawn = np.random.default_rng(seed), []
-    for _ in range(_DRAWS):
+    for _ in range(_N_RESAMPLES):
         times = np.bincount(rng.integers(len(names), size=len(names)), minlength=len(names))
-        # Of pairs with one shape, such as a reference, that shape always counts.
+        # A target common to all pairs, such as a reference, is not resampled.
         weight = times[a] * np.where(len(set(b)) == 1, 1, times[b])
         if weight.sum():
             drawn.append(float(weight @ values / weight.sum()))
@@ -218,7 +227,7 @@ def interval_over_shapes(means: Mapping[Pair, float], seed: int = 0) -> tuple[fl
 
 
 def row_of(name: str, model: str, split: Split, errors: Mapping[Pair, Floats], cpu: float) -> dict[str, Any]:
-    """A row of the table."""
+    """Compute the table row of a set."""
     means = {pair: float(each.mean()) for pair, each in errors.items()}
     values, (low, high) = np.array(list(means.values())), interval_over_shapes(means)
     row = {"set": name, "model": model, "shapes": len({each for pair in means for each in pair}), "pairs": len(means)}
@@ -229,8 +238,8 @@ def row_of(name: str, model: str, split: Split, errors: Mapping[Pair, Floats], c
 
 @runner.command
 def main(
-    data: Annotated[Path, Option(help="folder of the sets' folders")],
-    sets: Annotated[str, Option(help=f"of {', '.join(MODELS)}; default: those that are there")] = "",
+    data: Annotated[Path, Option(help="folder that contains the sets' folders")],
+    sets: Annotated[str, Option(help=f"of {', '.join(MODELS)}; default: those in the folder")] = "",
     model: Annotated[str | None, Option(help="default: human, or quadruped; or none")] = None,
     limit_pairs: runner.LimitPairs = None,
     cache: runner.Cache = None,
