@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.experiments.bench.own_verdicts import IN_FIVE, fitted_weights, row_of, spoiled
+from meshmatch.experiments.bench.own_verdicts import TREATMENTS, fitted_weights, row_of, spoiled
 
 
 def test_weights_cost_what_lost_fits_have_more_of() -> None:
@@ -25,7 +25,7 @@ def test_a_row_counts_what_is_right_and_what_is_believed() -> None:
 
 def test_a_collection_is_spoiled_as_it_says() -> None:
     made = spoiled("molars", Path(), 10, 0)
-    assert tuple(made.how.values()) == IN_FIVE
+    assert tuple(made.how.values()) == TREATMENTS
     cut, whole = (made.some.each[f"molars-0{k}"] for k in (4, 0))
     assert cut.cut and cut.shape.edges.open.any() and not whole.shape.edges.open.any()
     assert made.some.each["molars-02"].mirrored and not whole.mirrored

@@ -61,9 +61,9 @@ def test_joints_that_one_rig_lacks_and_feet_that_hang_from_the_root(tmp_path: Pa
     write_tube(tmp_path / "a.glb")
     one = rigs._Character(tmp_path / "a.glb")
     names = set(one.weights.names)
-    assert set(rigs._main(one, one.weights, names)) == {"hip", "knee", "foot"}
-    assert set(rigs._main(one, one.weights, names - {"knee"})) == {"hip", "foot"}  # the knee's go to the hip
-    assert one.counted_as("knee", {"foot"}) == ""
+    assert set(rigs._main_joints(one, one.weights, names)) == {"hip", "knee", "foot"}
+    assert set(rigs._main_joints(one, one.weights, names - {"knee"})) == {"hip", "foot"}  # the knee's go to the hip
+    assert one.nearest_shared("knee", {"foot"}) == ""
 
 
 def test_a_foot_of_inverse_kinematics_is_the_neighbour_of_the_shin_that_ends_there(tmp_path: Path) -> None:

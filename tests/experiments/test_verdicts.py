@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from meshmatch.errors import InputError
 from meshmatch.experiments.bench import verdicts
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, OF_PEOPLE, TUNED, Cases, furniture, melded
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, OF_PEOPLE, TUNED, Cases, box_union, furniture
 from meshmatch.fitting.judge.calibration import Calibration
 from meshmatch.geometry.triangles import face_parts, is_watertight
 from meshmatch.shapes.shape import Shape
@@ -40,7 +40,7 @@ def test_a_case_is_drawn_again_alike_with_its_truth(cases: Cases, family: str) -
 def test_furniture_is_watertight_and_of_one_piece() -> None:
     for number in range(3):
         corners = furniture(number, np.random.default_rng(number))
-        whole = melded(corners)
+        whole = box_union(corners)
         assert is_watertight(whole.faces) and face_parts(whole.faces, whole.V).max() == 0
         low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
         assert np.abs(whole.bounds - [low, high]).max() < 0.05 * np.ptp(whole.bounds, axis=0).max()

@@ -1,12 +1,12 @@
-"""How honest the verdicts of collections are that no model knows: deformations of a collection itself, some hopeless.
+"""Reliability of verdicts on collections without a model, in which some specimens are damaged or of another kind.
 
-Of each collection two in five specimens are spoiled: warped, cut by a plane, or replaced by a shape of another collection;
-all are turned at random, and of kinds with sides every third is a mirror image (`meshmatch.experiments.bench.specimens`). A
-fit is right if its maps to and from the sound specimens miss by less than a tenth of sqrt(area) on average, and lost
-otherwise, as that of another shape always is.
+In each collection four in ten specimens are spoiled: warped, cut by a plane, or replaced by a shape of another collection.
+All are rotated at random, and in sets with sides every third one is a mirror image (see
+`meshmatch.experiments.bench.specimens`). A fit is right if the mean errors of its maps to and from the sound specimens have
+a median of less than a tenth of sqrt(area), and lost otherwise; replaced specimens are always lost.
 
-A row counts verdicts by weights that other collections gave: those of generated shapes, without its own; ``--fit`` prints
-what all generated ones give, as `meshmatch.fitting.reference_statistics` keeps them. Next to them, "as they are", are the
+A row "of others" counts verdicts by weights fitted to the other collections of generated shapes. ``--fit`` prints weights
+fitted to all generated ones, in the form of `meshmatch.fitting.reference_statistics`. The rows "as they are" count the
 verdicts that users see.
 """
 
@@ -39,29 +39,32 @@ from meshmatch.outputs import make_folder
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 
-IN_FIVE = ("sound", "sound", "warped", "sound", "cut", "sound", "sound", "replaced", "sound", "warped")
-OTHER = {"femurs": "molars", "knees": "leaves", "molars": "knees", "leaves": "molars"}
-"""The collections, and of which one the shapes are that replace some."""
-RIGHT = 0.1  # of sqrt(area)
+TREATMENTS = ("sound", "sound", "warped", "sound", "cut", "sound", "sound", "replaced", "sound", "warped")
+REPLACEMENTS = {"femurs": "molars", "knees": "leaves", "molars": "knees", "leaves": "molars"}
+"""Collections, each with the one that its replaced specimens are from."""
+RIGHT = 0.1  # error below which a fit is right, as a fraction of sqrt(area)
 _COLUMNS = {"collection": "name", "weights": "weights", "fits": "fits:d", "right": "right:d", "good": "good:d"}
 _COLUMNS |= {"good, lost": "good_lost:d", "right, good or fair": "believed:d", "lost, not poor": "lost_not_poor:d"}
 
 
 @dataclass(frozen=True, eq=False)
 class Spoiled:
-    """A collection and what was done to each of its specimens."""
+    """A collection, and for each specimen what was done to it, one of `TREATMENTS`."""
 
     some: Specimens
     how: Mapping[str, str]
 
 
 def spoiled(name: str, data: Path, count: int, seed: int) -> Spoiled:
-    """A collection of so many specimens, if it has as many."""
+    """Make a collection of ``count`` specimens, or fewer if it has fewer."""
     rng = np.random.default_rng([seed, 30, SETS.index(name)])
-    shapes, others = wholes(name, data, count, seed + 1), list(wholes(OTHER[name], data, count, seed + 1).values())
+    shapes, others = (
+        wholes(name, data, count, seed + 1),
+        list(wholes(REPLACEMENTS[name], data, count, seed + 1).values()),
+    )
     made, how = {}, {}
     for number, (key, whole) in enumerate(shapes.items()):
-        what = IN_FIVE[number % len(IN_FIVE)]
+        what = TREATMENTS[number % len(TREATMENTS)]
         unit = float(np.sqrt(whole.area))
         if what == "warped":
             verts = deform_randomly(whole.verts, rng.uniform(0.05, 0.25) * unit, 0.3 * unit, rng)
@@ -75,7 +78,7 @@ def spoiled(name: str, data: Path, count: int, seed: int) -> Spoiled:
 
 
 def measure(name: str, data: Path, count: int, seed: int, work: Path) -> dict[str, Any]:
-    """Of each fit: whether it is right, and what its verdict is made of."""
+    """Fit a collection; return name, treatment, error and verdict of each fit."""
     found = spoiled(name, data, count, seed)
     scans, fits = work / "scans" / name, work / "fits" / name
     make_folder(scans)
@@ -96,16 +99,16 @@ def measure(name: str, data: Path, count: int, seed: int, work: Path) -> dict[st
 
 
 @dataclass(frozen=True, eq=False)
-class Alone:
-    """The fits of a collection before they were compared."""
+class SingleFits:
+    """The fits of a collection before they were compared with each other."""
 
     fits: Mapping[str, Fit]
     records: Mapping[str, Record]
     usual: Compared
 
     @classmethod
-    def read(cls, folder: Path) -> Alone:
-        """Of a folder of fits."""
+    def read(cls, folder: Path) -> SingleFits:
+        """Read the single fits of a folder of fits."""
         collection = Collection(folder)
         paths = {name: folder / SINGLE_FITS / f"{name}{SUFFIX}" for name in collection.names}
         records = {name: Record.of(read_fit_header(path)[1]["record"]) for name, path in paths.items()}
@@ -115,12 +118,12 @@ class Alone:
         return cls(fits, records, usual)
 
     def verdicts(self, weights: Weights) -> dict[str, str]:
-        """What is said by other weights."""
+        """Judge the fits by other weights."""
         usual = replace(self.usual, usual=replace(self.usual.usual, weights=weights))
         return {name: usual.judged(fit, self.records[name]).verdict for name, fit in self.fits.items()}
 
     def signs(self, rows: Sequence[Mapping[str, Any]]) -> tuple[Floats, Bools]:
-        """What weights weigh (N, 2), and which fits are right (N,), where nothing else is said against a fit."""
+        """Return features (N, 2), and which fits are right (N,), of fits that nothing but these features can make poor."""
         some = [row for row in rows if self.records[row["name"]].side >= 0 and self.fits[row["name"]].verdict != "poor"]
         records = [self.records[row["name"]] for row in some]
         values = [self.usual.usual.signs(each.stretch, each.residual) for each in records]
@@ -128,7 +131,7 @@ class Alone:
 
 
 def fitted_weights(values: Float[Floats, "N 2"], right: Bool[Bools, " N"], ridge: float = 0.002) -> Weights:
-    """By logistic regression with a little ridge, of signs that cost and never help."""
+    """Fit weights by ridge-regularized logistic regression; larger features never improve a verdict."""
     deviation = values.std(0) + 1e-9
 
     def loss(p: Floats) -> float:
@@ -140,12 +143,12 @@ def fitted_weights(values: Float[Floats, "N 2"], right: Bool[Bools, " N"], ridge
 
 
 def is_right(row: Mapping[str, Any]) -> bool:
-    """Whether a fit is; the error of another shape is none."""
+    """Return whether a fit is right; the error of a replaced specimen is None."""
     return row["error"] is not None and row["error"] < RIGHT
 
 
 def row_of(name: str, weights: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What verdicts say of right and of lost fits."""
+    """Count the verdicts of right and of lost fits."""
     right = [is_right(each) for each in rows]
     told = [each["verdict"] for each in rows]
     both = list(zip(right, told, strict=True))
@@ -160,14 +163,14 @@ def row_of(name: str, weights: str, rows: Sequence[Mapping[str, Any]]) -> dict[s
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
-    collections: Annotated[str, Option(help=f"of {', '.join(OTHER)}")] = ",".join(OTHER),
+    collections: Annotated[str, Option(help=f"of {', '.join(REPLACEMENTS)}")] = ",".join(REPLACEMENTS),
     count: Annotated[int, Option(min=6, help="specimens of each collection, if it has as many")] = 15,
-    fit: Annotated[bool, Option("--fit", help="also find the weights")] = False,
+    fit: Annotated[bool, Option("--fit", help="also fit the weights")] = False,
     work: runner.Work = None,
     threads: runner.Threads = 1,
     seed: runner.Seed = 0,
 ) -> runner.Report:
-    names = runner.split_names(collections, OTHER, "collection")
+    names = runner.split_names(collections, REPLACEMENTS, "collection")
     with tempfile.TemporaryDirectory() as temporary:
         place, asked = work or Path(temporary), {"count": count, "seed": seed}
         found, alone = {}, {}
@@ -175,7 +178,7 @@ def main(
             runner.log(name)
             call = partial(measure, name, data, count, seed, place)
             found[name] = runner.cached(place / "rows" / f"{name}.json", asked, call)["fits"]
-            alone[name] = Alone.read(place / "fits" / name)
+            alone[name] = SingleFits.read(place / "fits" / name)
     signs = {name: alone[name].signs(found[name]) for name in names if name in MAKERS}
 
     def weights_without(name: str) -> Weights:

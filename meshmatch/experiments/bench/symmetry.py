@@ -1,15 +1,15 @@
-"""Which point lies across from which, on shapes that are nearly symmetric: fits without a model, and pyclarcs.
+"""Bilateral symmetry maps of nearly symmetric shapes: fits without a model, single shapes, and pyclarcs.
 
-Truth: keypoints of SHREC'07 that are mirror images of each other. The error is the distance along the shape's edges
-between where a keypoint's counterpart is said to be and where it is, in percent of sqrt(area). A counterpart is lost beyond
-a tenth of sqrt(area).
+Ground truth are keypoints of SHREC'07 that are mirror images of each other. The error is the distance, along the shape's
+edges, between the computed and the true counterpart of a keypoint, in percent of sqrt(area). A counterpart is lost beyond a
+tenth of sqrt(area).
 
-- none: ``fit FOLDER --model none``; what lies across from a place of a shape is what lies across from it on the template.
-- alone: ``symmetry SHAPE``, of each shape by itself.
-- pyclarcs: ``clarcs asymmetry``: its plane of symmetry, and its registration of the mirror image, of each shape by itself,
-  with 4,000 triangles. Its widths are millimetres of endocasts, so shapes are brought to their size.
+- none: ``fit FOLDER --model none``; the symmetry map of the template is transferred to each shape.
+- alone: ``symmetry SHAPE`` of each single shape.
+- pyclarcs: ``clarcs asymmetry`` of each single shape: its plane of symmetry and its registration of the mirror image, with
+  4,000 triangles. Its kernel widths are meant for endocasts in millimeters, so shapes are scaled to that size.
 
-In the ``--work`` folder of `meshmatch.experiments.bench.specimens` the fits of that are taken.
+With the ``--work`` folder of `meshmatch.experiments.bench.specimens` its fits are reused.
 """
 
 from __future__ import annotations
@@ -44,23 +44,23 @@ PYCLARCS = "pyclarcs"
 ALONE = "alone"
 METHODS = (NO_MODEL, ALONE, PYCLARCS)
 SETS = tuple(name for name in BY_KEYPOINTS if name != "chair")
-_TRIANGLES, _SIZE = 4000, 200.0  # of what pyclarcs is given: mm
+_N_TRIANGLES, _SQRT_AREA_MM = 4000, 200.0  # of shapes for pyclarcs: number of triangles, and sqrt(area) in mm
 _COLUMNS = {"set": "set", "method": "method", "shapes": "shapes:d", "keypoints": "keypoints:d"}
 _COLUMNS |= {"error, % of sqrt(area)": "error:.2f", "worst shape": "worst:.2f", "lost": "lost:.1%"}
 
-Across = Callable[[str, Ints], Floats]
-"""Where the counterparts of some vertices of a shape are."""
+Counterparts = Callable[[str, Ints], Floats]
+"""Function from a shape's name and vertices (N,) to the positions (N, 3) of their counterparts."""
 
 
 def pairs_of(folder: Path, shape: str) -> Int[Ints, "N 2"]:
-    """Keypoints, and those that lie across from them."""
+    """Return pairs of keypoints that are mirror images of each other, in both orders."""
     plain, swapped = any_shapes.symmetries(folder, shape)
     paired = np.flatnonzero(plain != swapped)
     return np.stack([paired, swapped[paired]], axis=1)
 
 
-def by_fits(some: Specimens, scans: Path, work: Path) -> Across:
-    """By the template of a collection, and how it lies on its own mirror image."""
+def by_fits(some: Specimens, scans: Path, work: Path) -> Counterparts:
+    """Find counterparts by fits of a collection and the symmetry of its template."""
     collection = Collection(work, workers=1)
     collection.fit(scans, model=NO_MODEL)
     template = collection.template.shape
@@ -76,8 +76,8 @@ def by_fits(some: Specimens, scans: Path, work: Path) -> Across:
     return points
 
 
-def alone(some: Specimens, scans: Path, work: Path) -> Across:
-    """By each shape and its own mirror image."""
+def by_single_shapes(some: Specimens, scans: Path, work: Path) -> Counterparts:
+    """Find counterparts by the symmetry of each single shape."""
 
     def points(name: str, vertices: Ints) -> Floats:
         shape = some.each[name].shape
@@ -86,8 +86,8 @@ def alone(some: Specimens, scans: Path, work: Path) -> Across:
     return points
 
 
-def clarcs(some: Specimens, scans: Path, work: Path) -> Across:
-    """By pyclarcs."""
+def by_pyclarcs(some: Specimens, scans: Path, work: Path) -> Counterparts:
+    """Find counterparts by pyclarcs."""
     plane, coarse, fine, align, io, nonrigid = (
         import_module(f"{PYCLARCS}.{name}")
         for name in ("principal_axes", "coarse", "fine", "alignment", "io", "nonrigid")
@@ -95,7 +95,7 @@ def clarcs(some: Specimens, scans: Path, work: Path) -> Across:
 
     def points(name: str, vertices: Ints) -> Floats:
         shape = some.each[name].shape
-        small, unit = decimate(shape, _TRIANGLES), float(np.sqrt(shape.area)) / _SIZE
+        small, unit = decimate(shape, _N_TRIANGLES), float(np.sqrt(shape.area)) / _SQRT_AREA_MM
         verts, faces = np.asarray(small.verts) / unit, small.faces.tolist()
         found = coarse.coarse_symmetry(verts, plane.best_principal_axis_plane(verts), verbose=False)
         for step in (fine.em_icp_sym, fine.em_icp_sym_corres):
@@ -114,14 +114,18 @@ def clarcs(some: Specimens, scans: Path, work: Path) -> Across:
 
 
 def measure(name: str, method: str, data: Path, seed: int, work: Path) -> dict[str, Any]:
-    """A row."""
+    """Run a method on a set and return its table row."""
     some = load(name, data, any_shapes.SHAPES, seed)
     assert some.folder is not None
     scans = work / "scans" / name
     make_folder(scans)
     for key, each in some.each.items():
         save_shape(scans / f"{key}.ply", each.shape)
-    ways: dict[str, Callable[[Specimens, Path, Path], Across]] = {NO_MODEL: by_fits, ALONE: alone, PYCLARCS: clarcs}
+    ways: dict[str, Callable[[Specimens, Path, Path], Counterparts]] = {
+        NO_MODEL: by_fits,
+        ALONE: by_single_shapes,
+        PYCLARCS: by_pyclarcs,
+    }
     across, errors = ways[method](some, scans, work / "fits" / f"{name}-{method}"), {}
     for key, each in some.each.items():
         paired, known = pairs_of(some.folder, key), any_shapes.distances(some.folder, key)

@@ -1,10 +1,10 @@
-"""What a texture loses on its way to another shape and back, by two matches.
+"""Loss of a texture that is transferred to another shape and back.
 
-The sample dancer's texture goes to a target, into new texture coordinates, is written, and goes back to the dancer's own
-coordinates: from the target as it was, whose match knows the same pair of maps, and from the file that was written, as a
-second command would take it, which stands another way and has copies of vertices along seams. Colors (sRGB) at random points
-of the dancer are compared with those of before: PSNR in decibels. The first target is the dancer itself, which is what
-resampling costs.
+The sample dancer's texture is transferred to a target with new texture coordinates, saved, and transferred back to the
+dancer's coordinates: once from the original target shape, and once from the saved file, as a second command would do it,
+which has another orientation and duplicate vertices along seams. Colors (sRGB) at random points of the dancer are
+compared with the original ones by PSNR in decibels. The first target is the dancer itself, which gives the loss by
+resampling alone.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ COLUMNS = {
 
 
 def colors_at(path: Path, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
-    """sRGB of a textured file at the points of its surface nearest to given ones."""
+    """Sample a textured file (sRGB) at the points of its surface nearest to ``points``."""
     shape = meshmatch.load_shape(path)
     places = MappedMesh.of(shape).query(points)
     sampler = MaterialSampler(load_appearance(path, shape), SurfaceWalker(shape))
@@ -48,7 +48,7 @@ def colors_at(path: Path, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
 
 
 def measured(source: Path, target: Path, options: meshmatch.BakeOptions, folder: Path) -> dict[str, Any]:
-    """What is left of the source's texture, and what folds where it is baked on the target."""
+    """Transfer a texture there and back; return its PSNR, and the flipped and crushed shares of the target's map."""
     began = time.process_time()
     there, back = folder / "there.glb", folder / "back.glb"
     first = meshmatch.transfer_texture(source, target, uv="new", options=options)
@@ -78,8 +78,8 @@ def _psnr(one: Floats, two: Floats) -> float:
 
 @runner.command
 def main(
-    targets: Annotated[str, Option(help="samples, or paths")] = TARGETS,
-    size: Annotated[int, Option(min=16, help="texels a side")] = 2048,
+    targets: Annotated[str, Option(help="comma-separated samples or paths")] = TARGETS,
+    size: Annotated[int, Option(min=16, help="texels per side")] = 2048,
     threads: runner.Threads = 1,
 ) -> runner.Report:
     samples, options = bundled_folder() / "samples", meshmatch.BakeOptions(size=size, workers=threads)

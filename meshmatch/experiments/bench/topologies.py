@@ -1,8 +1,8 @@
-"""A body in an artist's own topology, wrapped onto other bodies, beside its exact refit.
+"""Wrapping an artist's topology onto other bodies, compared with the exact refit.
 
-MakeHuman's other topologies (`.proxy`) bind each vertex to a triangle of its base mesh. Each generated person lends the mesh
-to the next one, at rest and in a pose, whose body is cut into other triangles and is the scan. Distances are in centimetres:
-of each vertex from its exact place, and from the scan's surface; the exact refit does not lie on that either.
+MakeHuman's alternative topologies (`.proxy`) bind each vertex to a triangle of its base mesh. The mesh of each generated
+person is wrapped onto the next one, at rest and in a pose, whose remeshed body is the scan. Distances are in centimeters: of
+each vertex from its position in the exact refit, and from the scan's surface; the exact refit is not exactly on it either.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Shapes with known truth on which a verdict must be honest: sound and damaged ones, and what is of no kind at all.
+"""Test cases for verdicts, with ground truth: sound and damaged shapes, and shapes of other kinds.
 
-Every family is drawn from people, animals and poses that no training drew, a function of the seed and a number alone. The
-truth of a vertex is its vertex of the template (low resolution), or -1 where it has no counterpart; a shape of another
-kind has none anywhere. `TUNED` families may set thresholds, by seeds other than those that measure them; `KEPT` never.
+Each case of a family is a function of the seed and a number alone, with identities and poses that training did not use. The
+truth of a vertex is the corresponding vertex of the template (low resolution), or -1 without a counterpart; shapes of other
+kinds have none at all. Thresholds may be tuned on `TUNED` families, with seeds other than those that measure them, and never
+on the held-out `KEPT` families.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template, read_template
 
-_DRAWN = 200
-METRES = 1.7
-"""How large what is no person is made."""
+_N_BODIES = 200
+MAX_EXTENT = 1.7
+"""Longest side of shapes other than people, in meters."""
 LIMBS = (
     ("left thigh", "left shin", "left foot"), ("right thigh", "right shin", "right foot"),
     ("left upper arm", "left forearm", "left hand"), ("right upper arm", "right forearm", "right hand"),
@@ -41,58 +42,58 @@ LIMBS = (
     ("chest", "belly", "hips"),
     ("hips", "left thigh", "left shin", "left foot", "right thigh", "right shin", "right foot"),
 )  # fmt: skip
-"""Labels of parts of people that are cut out together."""
+"""Labels of people's parts that are cut out together."""
 
 
-CAMERAS, ENOUGH = 8, 2
-"""Around a body that is scanned; and how many must see a face."""
-NOISE = 0.0015  # of a scan, in shares of the bounding box's diagonal: 3 mm on a person
-_HEIGHTS = (-0.15, 0.45)  # of the cameras' directions, by turns: from below the middle and from above
+CAMERAS, MIN_VIEWS = 8, 2
+"""Number of cameras around a scanned body, and of those that must see a face."""
+NOISE = 0.0015  # standard deviation in scans, as a fraction of the bounding box's diagonal: 3 mm on a person
+_HEIGHTS = (-0.15, 0.45)  # y of the cameras' directions before normalization, alternating: from below and from above
 
 
-def ring(cameras: int = CAMERAS) -> Float[Floats, "C 3"]:
-    """Directions from a body, y up, to cameras around it."""
+def camera_directions(cameras: int = CAMERAS) -> Float[Floats, "C 3"]:
+    """Return directions from a body to cameras around it; y is up."""
     angle = 2 * np.pi * np.arange(cameras) / cameras + 0.2
     towards = np.stack([np.sin(angle), np.resize(_HEIGHTS, cameras), np.cos(angle)], axis=1)
     return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
 
-def scanned(body: Shape, seed: int) -> Shape:
-    """The faces of a body that enough cameras see, with noise along the normals: armpits, crotch and soles are holes."""
+def simulate_scan(body: Shape, seed: int) -> Shape:
+    """Simulate a scan: faces seen by enough cameras, with noise along normals; armpits, crotch and soles are holes."""
     centers = body.verts[body.faces].mean(axis=1)
-    views = np.sum([seen_faces(body, centers, towards) for towards in ring()], axis=0)
-    faces = body.faces[views >= ENOUGH]
+    views = np.sum([seen_faces(body, centers, towards) for towards in camera_directions()], axis=0)
+    faces = body.faces[views >= MIN_VIEWS]
     used = np.unique(faces)
     off = NOISE * body.diagonal * np.random.default_rng(seed).standard_normal((len(used), 1))
     return Shape(body.verts[used] + off * body.vertex_normals[used], np.searchsorted(used, faces), body.name)
 
 
 def direction(rng: np.random.Generator) -> Float[Floats, " 3"]:
-    """A random unit vector."""
+    """Draw a random unit vector."""
     found = rng.normal(size=3)
     return np.asarray(found / np.linalg.norm(found))
 
 
 def faces_kept(shape: Shape, truth: Ints, kept: Bool[Bools, " F"]) -> tuple[Shape, Ints]:
-    """Only some faces, with their vertices."""
+    """Return a shape of selected faces, and the truth of its vertices."""
     used, faces = np.unique(shape.faces[kept], return_inverse=True)
     return Shape(shape.verts[used], faces.reshape(-1, 3)), truth[used]
 
 
-def between(shape: Shape, truth: Ints, axis: Float[Floats, " 3"], low: float, high: float) -> tuple[Shape, Ints]:
-    """Only the faces between two quantiles (0..1) of their places along an axis."""
+def faces_between(shape: Shape, truth: Ints, axis: Float[Floats, " 3"], low: float, high: float) -> tuple[Shape, Ints]:
+    """Return the faces between two quantiles (0 to 1) of their centers' coordinates along an axis."""
     along = shape.verts[shape.faces].mean(1) @ axis
     first, last = np.quantile(along, [low, high])
     return faces_kept(shape, truth, np.asarray((along > first) & (along <= last)))
 
 
-def joined(shape: Shape, other: Shape, at: Float[Floats, "W 3"]) -> Shape:
-    """Two shapes as one, the second one with its vertices elsewhere."""
+def concatenate(shape: Shape, other: Shape, at: Float[Floats, "W 3"]) -> Shape:
+    """Concatenate two shapes; the vertices of the second one are moved to ``at``."""
     return Shape(np.concatenate([shape.verts, at]), np.concatenate([shape.faces, other.faces + shape.V]))
 
 
 def grid(side: float, cells: int) -> Shape:
-    """A square in the plane y = 0 around the origin."""
+    """Build a square in the plane y = 0, centered at the origin."""
     x, z = np.meshgrid(*[np.linspace(-0.5 * side, 0.5 * side, cells + 1)] * 2, indexing="ij")
     corner = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, 1:].ravel(), corner[1:, :-1].ravel()
@@ -100,8 +101,8 @@ def grid(side: float, cells: int) -> Shape:
     return Shape(np.column_stack([x.ravel(), np.zeros(x.size), z.ravel()]), faces)
 
 
-def refined(shape: Shape, F: int) -> Shape:
-    """The same surface in F triangles or a few more; where triangles of two sizes meet there are slits."""
+def subdivide_to(shape: Shape, F: int) -> Shape:
+    """Subdivide a surface into F triangles or a few more; T-junctions leave slits between triangles of two sizes."""
     verts, faces = np.asarray(shape.verts), np.asarray(shape.faces)
     while len(faces) < F:
         some = np.arange(min(len(faces), -(-(F - len(faces)) // 3)))
@@ -109,8 +110,8 @@ def refined(shape: Shape, F: int) -> Shape:
     return Shape(verts, faces)
 
 
-def solids(rng: np.random.Generator) -> Shape:
-    """A few boxes, balls and rods run together."""
+def random_solids(rng: np.random.Generator) -> Shape:
+    """Draw a few overlapping boxes, balls and capsules."""
     parts = []
     for _ in range(int(rng.integers(1, 7))):
         size = rng.uniform(0.1, 1.0, 3)
@@ -122,20 +123,20 @@ def solids(rng: np.random.Generator) -> Shape:
         made.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
         made.apply_translation(rng.normal(size=3) * 0.4)
         parts.append(Shape(np.asarray(made.vertices), np.asarray(made.faces)))
-    return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+    return reduce(lambda whole, part: concatenate(whole, part, part.verts), parts)
 
 
-def boxes(corners: Sequence[Float[Floats, "2 3"]], edge: float) -> Shape:
-    """Boxes by their lower and upper corners, which may run into each other; no edge is longer than that."""
+def build_boxes(corners: Sequence[Float[Floats, "2 3"]], edge: float) -> Shape:
+    """Build boxes, which may overlap, from their lower and upper corners, without edges longer than ``edge``."""
     parts = []
     for low, high in corners:
         made = trimesh.creation.box(high - low).subdivide_to_size(edge)
         parts.append(Shape(np.asarray(made.vertices) + 0.5 * (low + high), np.asarray(made.faces)))
-    return reduce(lambda whole, part: joined(whole, part, part.verts), parts)
+    return reduce(lambda whole, part: concatenate(whole, part, part.verts), parts)
 
 
 def furniture(number: int, rng: np.random.Generator) -> list[Float[Floats, "2 3"]]:
-    """The boxes of a chair, a plane or a table, by turns; y is up."""
+    """Draw the boxes (lower and upper corners) of a chair, a plane or a table, depending on ``number``; y is up."""
     wide, deep, tall, thick = rng.uniform((0.2, 0.2, 0.35, 0.02), (0.5, 0.5, 0.8, 0.05))
     if number % 3 == 1:
         tail = rng.uniform(0.1, 0.25)
@@ -155,9 +156,11 @@ def furniture(number: int, rng: np.random.Generator) -> list[Float[Floats, "2 3"
     return [np.array([np.subtract(middle, half), np.add(middle, half)]) for middle, half in solids]
 
 
-def melded(corners: Sequence[Float[Floats, "2 3"]], cells: int = 48) -> Shape:
-    """Boxes by their lower and upper corners as one watertight mesh with round edges, of so many cells along its longest
-    side."""
+def box_union(corners: Sequence[Float[Floats, "2 3"]], cells: int = 48) -> Shape:
+    """Build the union of boxes as one watertight mesh with rounded edges, by marching cubes of their distance field.
+
+    The grid has ``cells`` cells along the longest side.
+    """
     ends = np.array(corners)
     low, high = ends[:, 0].min(0), ends[:, 1].max(0)
     step = float((high - low).max()) / cells
@@ -172,36 +175,36 @@ def melded(corners: Sequence[Float[Floats, "2 3"]], cells: int = 48) -> Shape:
 
 
 def on_floor(shape: Shape, side: float) -> Shape:
-    """A shape above the middle of a square that it stands on."""
+    """Put a shape on the middle of a square floor; ``side`` is its length."""
     plane = grid(side, 40)
     at = np.array([shape.verts[:, 0].mean(), shape.verts[:, 1].min(), shape.verts[:, 2].mean()])
-    return joined(shape, plane, plane.verts + at)
+    return concatenate(shape, plane, plane.verts + at)
 
 
-def no_body(verts: Floats, faces: Ints) -> tuple[Shape, Ints]:
-    """A shape as large as a person, none of whose vertices has a counterpart."""
-    return Shape(verts * (METRES / np.ptp(verts, axis=0).max()), faces), np.full(len(verts), -1)
+def as_unrelated(verts: Floats, faces: Ints) -> tuple[Shape, Ints]:
+    """Scale a shape to the size of a person; no vertex has a counterpart."""
+    return Shape(verts * (MAX_EXTENT / np.ptp(verts, axis=0).max()), faces), np.full(len(verts), -1)
 
 
 def rough(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
-    """The vertices with noise."""
+    """Add noise to the vertices."""
     return np.asarray(shape.verts + rng.uniform(0.002, 0.04) * rng.standard_normal(shape.verts.shape))
 
 
 def swollen(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
-    """The vertices moved outwards."""
+    """Move the vertices outward along their normals."""
     return np.asarray(shape.verts + rng.uniform(0.01, 0.06) * shape.vertex_normals)
 
 
 def melted(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
-    """The vertices smoothed, up to some hundred times."""
+    """Smooth the vertices, in up to 400 iterations."""
     mesh = trimesh.Trimesh(shape.verts, shape.faces, process=False)
     trimesh.smoothing.filter_laplacian(mesh, iterations=int(rng.integers(20, 400)))
     return np.asarray(mesh.vertices)
 
 
 def twisted(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
-    """The vertices turned about the y axis, the further the higher."""
+    """Twist the vertices about the y axis."""
     middle = shape.verts.mean(0)
     local = shape.verts - middle
     turns = Rotation.from_rotvec(np.outer(local[:, 1] * rng.uniform(0.3, 4.0), [0, 1, 0]))
@@ -209,14 +212,14 @@ def twisted(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
 
 
 def sheared(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
-    """The vertices moved along one axis as another one says."""
+    """Shear the vertices along one axis, proportionally to another."""
     axis, verts = rng.permutation(3), np.array(shape.verts)
     verts[:, axis[0]] += rng.uniform(0.2, 1.5) * verts[:, axis[1]]
     return verts
 
 
 def lumpy(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
-    """The vertices moved by a smooth random field."""
+    """Move the vertices by a smooth random field."""
     verts = np.array(shape.verts)
     for _ in range(12):
         wave = direction(rng) * rng.uniform(2, 9)
@@ -227,7 +230,7 @@ def lumpy(shape: Shape, rng: np.random.Generator) -> Float[Floats, "V 3"]:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A shape, and of every vertex the template's vertex that it belongs to, or -1."""
+    """A shape, and the corresponding template vertex of each of its vertices, or -1."""
 
     family: str
     shape: Shape
@@ -236,46 +239,46 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Cases:
-    """Draws cases of a kind of which there are generated shapes."""
+    """Generator of test cases for a kind."""
 
     kind: str = "human"
     seed: int = 0
 
     @cached_property
     def template(self) -> Template:
-        """What the truth is about."""
+        """The template whose vertices the truth refers to."""
         return read_template("human-T") if self.kind == "human" else self._others[self.kind].template
 
     @cached_property
     def bodies(self) -> Float[Floats, "N V 3"]:
-        """People, animals, hands or heads in poses, about as large as a person."""
+        """Posed shapes of the kind, about as large as a person."""
         if self.kind == "human":
-            return unseen_bodies(self.template, _DRAWN, seed=1000 + self.seed)
-        return self._drawn(self.kind)
+            return unseen_bodies(self.template, _N_BODIES, seed=1000 + self.seed)
+        return self._generated(self.kind)
 
     @cached_property
     def _others(self) -> dict[str, Generator]:
         return {name: Kind(name, 64).generator(7100 + self.seed) for name in GENERATORS}
 
-    def _drawn(self, kind: str) -> Float[Floats, "N V 3"]:
-        if kind not in self._kept:
+    def _generated(self, kind: str) -> Float[Floats, "N V 3"]:
+        if kind not in self._generated_cache:
             generator = torch.Generator().manual_seed(7100 + self.seed)
-            verts = self._others[kind].draw(_DRAWN, generator).double().numpy()
-            self._kept[kind] = verts * (METRES / np.ptp(verts, axis=1).max(1)[:, None, None])
-        return self._kept[kind]
+            verts = self._others[kind].draw(_N_BODIES, generator).double().numpy()
+            self._generated_cache[kind] = verts * (MAX_EXTENT / np.ptp(verts, axis=1).max(1)[:, None, None])
+        return self._generated_cache[kind]
 
     @cached_property
-    def _kept(self) -> dict[str, Floats]:
+    def _generated_cache(self) -> dict[str, Floats]:
         return {}
 
     @cached_property
     def _opposite(self) -> Int[Ints, " V"]:
-        """The template's vertex across the plane of its symmetry."""
+        """Index of the vertex nearest to each vertex's mirror image in the template's plane of symmetry."""
         verts = self.template.shape.verts
         return np.asarray(cKDTree(verts).query(verts * [-1, 1, 1])[1], dtype=np.int64)
 
     def draw(self, family: str, number: int) -> Case:
-        """A case of a family, turned anywhere, in any unit."""
+        """Draw a case of a family, in a random orientation and unit of length."""
         rng = np.random.default_rng([self.seed, number, *family.encode()])
         shape, truth = FAMILIES[family](self, number, rng)
         turn, unit = Rotation.random(random_state=rng).as_matrix(), 10.0 ** rng.uniform(-2, 3)
@@ -283,7 +286,7 @@ class Cases:
         return Case(family, Shape(verts, shape.faces, f"{family} {number}"), truth)
 
     def body(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """A sound shape, by turns with the template's triangles and with others."""
+        """Draw a sound shape: with the template's triangles for odd numbers, remeshed for even ones."""
         verts = self.bodies[int(rng.integers(len(self.bodies)))]
         shape = Shape(verts, self.template.shape.faces)
         if number % 2:
@@ -292,7 +295,7 @@ class Cases:
         other = decimate(Shape(fine.vertices, fine.faces), int(rng.integers(5_000, 16_000)))
         return other, np.asarray(cKDTree(verts).query(other.verts)[1], dtype=np.int64)
 
-    # Right as a rule.
+    # Cases that usually have a right fit.
 
     def _cloud(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
@@ -312,7 +315,7 @@ class Cases:
 
     def _scan(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        scan = scanned(shape, int(rng.integers(2**31)))
+        scan = simulate_scan(shape, int(rng.integers(2**31)))
         distance, near = cKDTree(shape.verts).query(scan.verts)
         return scan, np.where(distance < 0.05, truth[near], -1)
 
@@ -323,27 +326,29 @@ class Cases:
         return self._character(number, (TOON, CHILD)[number % 2])
 
     def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:
-        drawn, faces = self._casts.setdefault(kind, []), self.template.shape.faces
-        corners = np.concatenate([np.arange(self.template.shape.V), faces[:, 0]])  # of the body's other triangles
+        drawn, faces = self._character_cache.setdefault(kind, []), self.template.shape.faces
+        corners = np.concatenate(
+            [np.arange(self.template.shape.V), faces[:, 0]]
+        )  # template vertex of each vertex of a subdivide_to body
         while len(drawn) <= number:
             made = clothed_people(self.template, 10, kind, 100 + self.seed + len(drawn))
             drawn += [(each.shape, corners[np.asarray(each.places)]) for each in made]
         return drawn[number]
 
     @cached_property
-    def _casts(self) -> dict[int, list[tuple[Shape, Ints]]]:
+    def _character_cache(self) -> dict[int, list[tuple[Shape, Ints]]]:
         return {}
 
     def _inside_out(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         return Shape(shape.verts, shape.faces[:, ::-1]), truth
 
-    # Damaged.
+    # Damaged shapes.
 
     def _scaled(
         self, number: int, rng: np.random.Generator, factor: Callable[[np.random.Generator], float]
     ) -> tuple[Shape, Ints]:
-        """Along one axis."""
+        """Scale a body along a random axis."""
         times = factor(rng)
         shape, truth = self.body(number, rng)
         axis = np.eye(3)[rng.integers(3)] if number % 3 else direction(rng)
@@ -353,7 +358,7 @@ class Cases:
     def _warped(
         self, number: int, rng: np.random.Generator, warp: Callable[[Shape, np.random.Generator], Floats]
     ) -> tuple[Shape, Ints]:
-        """Its vertices elsewhere."""
+        """Apply a deformation to a body."""
         shape, truth = self.body(number, rng)
         return Shape(warp(shape, rng), shape.faces), truth
 
@@ -367,7 +372,7 @@ class Cases:
         return faces_kept(shape, truth, np.asarray(kept))
 
     def _in_limb(self, truth: Ints, rng: np.random.Generator, most: int = len(LIMBS)) -> Bool[Bools, " V"]:
-        """Whether vertices are of some limb, one of the first so many: of people a named one, else a few parts."""
+        """Select the vertices of a limb at random: one of the first ``most`` of `LIMBS` for people, else a few parts."""
         names, labels = self.template.label_names or (), np.asarray(self.template.labels)
         if self.kind == "human":
             asked = [names.index(name) for name in LIMBS[int(rng.integers(most))]]
@@ -378,77 +383,77 @@ class Cases:
 
     def _cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
-        return between(shape, truth, direction(rng), rng.uniform(0.1, 0.75), 1.0)
+        return faces_between(shape, truth, direction(rng), rng.uniform(0.1, 0.75), 1.0)
 
     def _merged(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         (one, first), (other, second) = self.body(number, rng), self.body(number + 1, rng)
         apart = rng.uniform(0.0, 0.8) * direction(rng)
-        return joined(one, other, other.verts + apart), np.concatenate([first, second])
+        return concatenate(one, other, other.verts + apart), np.concatenate([first, second])
 
     def _floor(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         whole = on_floor(shape, rng.uniform(0.8, 6.0))
         return whole, np.append(truth, np.full(whole.V - shape.V, -1))
 
-    # No bodies.
+    # Shapes of other kinds.
 
     def _animal(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """An animal, a hand or a head."""
+        """Draw a shape of another kind with a generator: an animal, a hand or a head."""
         kind = [name for name in GENERATORS if name != self.kind][number % 2 if self.kind != "human" else number % 3]
-        verts = self._drawn(kind)
-        return no_body(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
+        verts = self._generated(kind)
+        return as_unrelated(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
 
     def _furniture(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        whole = melded(furniture(number, rng))
-        return no_body(whole.verts, whole.faces)
+        whole = box_union(furniture(number, rng))
+        return as_unrelated(whole.verts, whole.faces)
 
     def _solid(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        whole = solids(rng)
-        return no_body(whole.verts, whole.faces)
+        whole = random_solids(rng)
+        return as_unrelated(whole.verts, whole.faces)
 
     def _kit(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """Furniture of boxes that run into each other."""
-        kit = boxes(furniture(number, rng), 0.2)
-        return no_body(kit.verts, kit.faces)
+        """Draw furniture of overlapping boxes."""
+        kit = build_boxes(furniture(number, rng), 0.2)
+        return as_unrelated(kit.verts, kit.faces)
 
-    # Kept: nothing is tuned on these.
+    # Held-out families: nothing is tuned on these.
 
     def _amputated(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
         shape, truth = self.body(number, rng)
         lost = self._in_limb(truth, rng, 8)[shape.faces].all(1)
         return faces_kept(shape, truth, np.asarray(~lost))
 
-    def _beside(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """Boxes and balls on or in the body."""
+    def _with_objects(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Add boxes on or in the body."""
         shape, truth = self.body(number, rng)
         for _ in range(int(rng.integers(1, 4))):
             size = rng.uniform(0.05, 0.8, 3)
-            thing = boxes([np.stack([-0.5 * size, 0.5 * size])], 0.08)
+            thing = build_boxes([np.stack([-0.5 * size, 0.5 * size])], 0.08)
             at = shape.verts[rng.integers(shape.V)] + rng.normal(size=3) * 0.1
-            shape = joined(shape, thing, thing.verts + at)
+            shape = concatenate(shape, thing, thing.verts + at)
             truth = np.append(truth, np.full(thing.V, -1))
         return shape, truth
 
-    def _two_cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """Two cuts: what lies between two parallel planes."""
+    def _cut_twice(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Keep what is between two parallel planes."""
         shape, truth = self.body(number, rng)
         axis, low = direction(rng), rng.uniform(0, 0.5)
-        return between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
+        return faces_between(shape, truth, axis, low, low + rng.uniform(0.3, 0.5))
 
     def _dense(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """The same surface in two million triangles."""
+        """Subdivide a body into two million triangles."""
         shape, truth = self.body(number, rng)
-        fine = refined(shape, 2_000_000)
+        fine = subdivide_to(shape, 2_000_000)
         return fine, truth[cKDTree(shape.verts).query(fine.verts)[1]]
 
     def _fused(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """One skin around a body and the plinth, plate or floor that it stands in; of every other floor the top alone."""
+        """Fuse a body and its plinth, plate or floor into one surface; scanned floors have only their top side."""
         shape, truth = self.body(number, rng)
         whole, near = fused_with_base(shape, ("plinth", "plate", "floor", "scanned floor")[number % 4], rng)
         return whole, np.where(near < 0, -1, truth[near])
 
     def _not_manifold(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """With triangles twice, turned round, and across the body."""
+        """Duplicate triangles, also with reversed orientation, and add triangles across the body."""
         shape, truth = self.body(number, rng)
         some = rng.permutation(shape.F)
         twice, turned, across = (shape.faces[some[k::3]][: int(0.04 * shape.F)] for k in range(3))
@@ -483,10 +488,10 @@ TUNED: dict[str, Family] = {
 KEPT: dict[str, Family] = {
     "twisted": partial(Cases._warped, warp=twisted),
     "amputated": Cases._amputated,
-    "things beside": Cases._beside,
+    "things beside": Cases._with_objects,
     "sheared": partial(Cases._warped, warp=sheared),
     "lumpy": partial(Cases._warped, warp=lumpy),
-    "cut twice": Cases._two_cut,
+    "cut twice": Cases._cut_twice,
     "two million": Cases._dense,
     "not manifold": Cases._not_manifold,
     "kit": Cases._kit,

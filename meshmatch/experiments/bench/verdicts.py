@@ -1,15 +1,15 @@
-"""How honest verdicts and confidences are: shapes of which some can be matched and some cannot, and what is said of them.
+"""Reliability of verdicts and confidences, on sound and damaged shapes and on shapes of other kinds.
 
-Each case (`meshmatch.experiments.bench.verdict_cases`) is matched onto a shape that another person, or animal, made in
-another pose, one of two dozen, every fourth of which is cut. The error of a vertex is the straight distance on the
-target between its partner and the true one, in centimetres of a person of 1.9 m2; a map's error is the mean over the
-vertices that have a partner, and that of a shape of another kind is infinite. A map is right below 5 cm and wrong
-above 8. Confidence is compared, at every vertex, with how often the error is within 5 cm; a vertex without a partner
-never is. All maps weigh the same, however many vertices they have. The longest fit is in CPU seconds.
+Each case (`meshmatch.experiments.bench.verdict_cases`) is matched to one of 24 targets: other people (or animals) in other
+poses, every fourth of which is cut. The error of a vertex is the Euclidean distance on the target between its partner and
+the true one, in centimeters for a person of 1.9 m2. A map's error is the mean over the vertices with a true partner, and
+infinite for shapes of other kinds. A map is right below 5 cm and wrong above 8 cm. Confidence is compared, at every vertex,
+with how often the error is within 5 cm; a vertex without a true partner counts as wrong. All maps have the same weight,
+whatever their number of vertices. The longest fit is in CPU seconds.
 
-``--fit`` prints the weights that tell right from wrong best, of the cases of this run, in the form in which
-`meshmatch.fitting.judge.calibration` keeps them; those of other kinds lean on people's. Measure with other seeds than those
-that it names.
+``--fit`` prints the weights that best separate right from wrong maps of this run, in the form of
+`meshmatch.fitting.judge.calibration`; those of other kinds are regularized towards those of people. Measure verdicts with
+other seeds than those that the calibration names.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, OF_PEOPLE, Case, Cases, between, direction
+from meshmatch.experiments.bench.verdict_cases import FAMILIES, KEPT, OF_PEOPLE, Case, Cases, direction, faces_between
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.judge.calibration import CALIBRATION, Calibration
@@ -45,14 +45,19 @@ from meshmatch.shapes.shape import Shape
 RIGHT_CM, WRONG_CM = 5.0, 8.0
 VERDICTS = ("good", "fair", "poor")
 REFUSED = "refused"
-_TARGETS, _FINE, _COARSE = 24, 100, 10
-_OFTEN = 200  # vertices of a step of confidence, at least, of which a share is told
+_N_TARGETS, _N_FINE_BINS, _N_BINS = 24, 100, 10
+_MIN_VERTICES = 200  # minimum number of vertices for which a bin of confidence has a row of values
 _COLUMNS = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d", "refused": "refused:d"}
 _COLUMNS |= {"under 5 cm": "right:d", "over 8 cm": "wrong:d", "mean cm": "mean_cm:.1f", "worst": "worst_cm:.1f"}
 _COLUMNS |= {"longest": "seconds:.1f"}
-_STEPS = {"confidence": "of", "vertices": "vertices:d", "mean": "confidence:.3f", "within 5 cm": "near:.3f"}
-_IN_ALL = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d"}
-_IN_ALL |= {
+_CONFIDENCE_COLUMNS = {
+    "confidence": "of",
+    "vertices": "vertices:d",
+    "mean": "confidence:.3f",
+    "within 5 cm": "near:.3f",
+}
+_TOTAL_COLUMNS = {"maps": "maps:d", "good": "good:d", "fair": "fair:d", "poor": "poor:d"}
+_TOTAL_COLUMNS |= {
     "good, over 8 cm": "good_and_wrong:d",
     "of good ones, at most": "at_most:.1%",
     "under 5 cm": "right:d",
@@ -64,7 +69,7 @@ GROUPS = {"tuned": [name for name in FAMILIES if name not in KEPT], "kept": list
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A shape to match onto: its fit, where all of the template's vertices belong, and which of them it has."""
+    """A target: its fit, the true positions of all template vertices, and which of them the shape has."""
 
     shape: Shape
     fit: Fit
@@ -73,12 +78,14 @@ class Target:
 
 
 def target_of(others: Cases, matcher: Matcher, number: int) -> Target:
-    """A sound shape of another person than the cases; every fourth is cut, again where a cut leaves parts far apart."""
+    """Make a target from another person than the cases; every fourth is cut, again if the cut shape cannot be fitted."""
     rng, cut = np.random.default_rng([others.seed, number]), number % 4 == 3
     places, faces = others.bodies[number], others.template.shape.faces
     whole, every = Shape(places, faces, f"target {number}"), np.arange(len(places))
     while True:
-        shape, kept = between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
+        shape, kept = (
+            faces_between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
+        )
         with suppress(InputError) if cut else nullcontext():
             has = np.zeros(len(places), bool)
             has[kept] = True
@@ -86,7 +93,7 @@ def target_of(others: Cases, matcher: Matcher, number: int) -> Target:
 
 
 def measured(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
-    """What is said of a case and its map, and how far it is off."""
+    """Match a case to a target; return its verdict, error, features and confidence bins."""
     began = time.process_time()
     row: dict[str, Any] = {"family": case.family, "verdict": REFUSED, "error": float("inf")}
     try:
@@ -99,29 +106,30 @@ def measured(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
     has = known[target.has[case.truth[known]]]
     off = target.shape.verts[vertex_map.index[has]] - target.places[case.truth[has]]
     cm = np.full(len(case.truth), np.inf)
-    cm[has] = _cm_of(target) * np.linalg.norm(off, axis=1)
+    cm[has] = _cm_per_unit(target) * np.linalg.norm(off, axis=1)
     row |= {"verdict": vertex_map.verdict, "fit": fit.verdict, "trust": fit.trust, "reasons": "; ".join(fit.reasons)}
     row |= {"error": float(cm[has].mean()) if len(has) else float("inf"), "partial": fit.partial}
     assert fit.signs is not None
     return row | {"signs": list(fit.signs.values()), "bins": fine_bins(vertex_map.confidence, cm <= RIGHT_CM)}
 
 
-def _cm_of(target: Target) -> float:
-    """Centimetres in a unit of the target's file, were it a person."""
+def _cm_per_unit(target: Target) -> float:
+    """Return centimeters per unit of the target's file, scaled to a person of 1.9 m2."""
     return CM_PER_UNIT / float(np.sqrt(Shape(target.places, np.asarray(target.fit.faces)).area))
 
 
 def fine_bins(confidence: Float[Floats32, " V"], near: Bool[Bools, " V"]) -> dict[str, list[float]]:
-    """By steps of confidence: how many vertices, the sum of their confidences, and how many are near."""
-    which = np.minimum((confidence * _FINE).astype(int), _FINE - 1)
+    """Histogram confidences: number of vertices, sum of confidences, and number of near vertices in each fine bin."""
+    which = np.minimum((confidence * _N_FINE_BINS).astype(int), _N_FINE_BINS - 1)
     columns: dict[str, np.ndarray] = {"count": np.ones(len(near)), "sum": confidence, "near": near}
-    return {name: np.bincount(which, values, _FINE).tolist() for name, values in columns.items()}
+    return {name: np.bincount(which, values, _N_FINE_BINS).tolist() for name, values in columns.items()}
 
 
 def calibration(found: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], float]:
-    """A row for every tenth of confidence: vertices, mean confidence, share near. And how well confidence separates.
+    """Compare confidence with the share of vertices that are near, in ten bins.
 
-    All maps weigh the same.
+    Return a row for each bin (number of vertices, mean confidence, share near) and the AUC of confidence. All maps have
+    the same weight.
     """
     vertices = np.sum([each["bins"]["count"] for each in found], axis=0)
     total = {
@@ -129,19 +137,19 @@ def calibration(found: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]
         for name in ("count", "sum", "near")
     }
     rows = []
-    for number in range(_COARSE):
-        part = slice(number * _FINE // _COARSE, (number + 1) * _FINE // _COARSE)
+    for number in range(_N_BINS):
+        part = slice(number * _N_FINE_BINS // _N_BINS, (number + 1) * _N_FINE_BINS // _N_BINS)
         count, expected, near = (float(total[name][part].sum()) for name in ("count", "sum", "near"))
         many = int(vertices[part].sum())
-        row: dict[str, Any] = {"of": f"{number / _COARSE:.1f} to {(number + 1) / _COARSE:.1f}", "vertices": many}
-        rows.append(row | ({"confidence": expected / count, "near": near / count} if many >= _OFTEN else {}))
+        row: dict[str, Any] = {"of": f"{number / _N_BINS:.1f} to {(number + 1) / _N_BINS:.1f}", "vertices": many}
+        rows.append(row | ({"confidence": expected / count, "near": near / count} if many >= _MIN_VERTICES else {}))
     near, far = total["near"], total["count"] - total["near"]
     below = np.cumsum(far) - 0.5 * far
     return rows, float((near * below).sum() / max(near.sum() * far.sum(), 1e-12))
 
 
 def rows_of(found: Sequence[Mapping[str, Any]], group: str, names: Sequence[str]) -> list[dict[str, Any]]:
-    """A row for every value of a column: how many maps, of which verdict, and how many of each are right, or wrong."""
+    """Summarize maps by the value of a column: numbers of each verdict, of right and of wrong maps, and errors."""
     rows = []
     for name in names:
         some = [each for each in found if each[group] == name]
@@ -158,9 +166,9 @@ def rows_of(found: Sequence[Mapping[str, Any]], group: str, names: Sequence[str]
 
 
 def bars_of(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The numbers by which verdicts are judged; a refused shape is no map.
+    """Compute the criteria for verdicts; refused shapes do not count as maps.
 
-    ``at_most``: the upper end of the 95 % interval of the share of wrong maps among good ones.
+    ``at_most`` is the upper end of the 95 % interval of the share of wrong maps among good ones.
     """
     good = [each for each in found if each["verdict"] == "good"]
     right = [each for each in found if each["verdict"] != REFUSED and each["error"] < RIGHT_CM]
@@ -179,8 +187,10 @@ def bars_of(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def fitted_weights(
     found: Sequence[Mapping[str, Any]], near: Calibration | None = None
 ) -> tuple[Float[Floats, " N"], float]:
-    """Weights of the signs and an offset: the logistic regression of being wrong, with a little ridge about 0, or about
-    those ``near``; no sign speaks for a fit. Maps onto a target whose own fit is poor say nothing of a case.
+    """Fit weights of the features and an offset by logistic regression of being wrong.
+
+    A small ridge penalty pulls towards 0, or towards the calibration ``near``. Weights are not negative: no feature improves
+    a verdict. Maps that are poor only because of the target's fit are left out.
     """
     known = [
         each for each in found if each["verdict"] != REFUSED and (each["verdict"] != "poor" or each["fit"] == "poor")
@@ -188,7 +198,7 @@ def fitted_weights(
     X, error = np.array([each["signs"] for each in known]), np.array([each["error"] for each in known])
     weights, offset = (np.zeros(X.shape[1]), 0.0) if near is None else (np.array(near.weights), near.offset)
     sign = np.where(error > WRONG_CM, 1.0, -1.0)
-    weight = np.where((error > RIGHT_CM) & (error < 1.5 * WRONG_CM), 0.5, 1.0)  # neither quite right nor quite wrong
+    weight = np.where((error > RIGHT_CM) & (error < 1.5 * WRONG_CM), 0.5, 1.0)  # half weight around the limits
     deviation = np.where(X.std(0) > 0, X.std(0), 1.0)
     Z = X / deviation
 
@@ -201,23 +211,23 @@ def fitted_weights(
     return weights + p[1:] / deviation, offset + float(p[0])
 
 
-def of_seed(
+def measure_seed(
     kind: str, names: Sequence[str], count: int, seed: int, threads: int, folder: Path
 ) -> Iterator[dict[str, Any]]:
-    """So many cases of each family, of one seed, measured where they are not kept in the folder already."""
+    """Measure ``count`` cases of each family for one seed; results are cached in the folder."""
     cases, matcher = Cases(kind, seed), Matcher(kind, FitConfig(seed=seed), threads)
     onto = cache(partial(target_of, Cases(kind, 900 + seed), matcher))
 
     def family(name: str) -> dict[str, Any]:
         first = list(FAMILIES).index(name) * count
         numbers = runner.track(range(count), f"{name}, seed {seed}", count)
-        return {"found": [measured(cases.draw(name, k), onto((first + k) % _TARGETS), matcher) for k in numbers]}
+        return {"found": [measured(cases.draw(name, k), onto((first + k) % _N_TARGETS), matcher) for k in numbers]}
 
     for name in names:
-        which = {"kind": kind, "family": name, "count": count, "seed": seed, "targets": _TARGETS}
+        which = {"kind": kind, "family": name, "count": count, "seed": seed, "targets": _N_TARGETS}
         path = folder / f"{kind}-{name.replace(' ', '-')}-{seed}.json"
         kept = runner.cached(path, which, partial(family, name))["found"]
-        # null is what JSON makes of infinity
+        # JSON has null for infinity
         found = [each | {"error": np.inf if each["error"] is None else each["error"]} for each in kept]
         (row,) = rows_of(found, "family", [name])
         runner.log(f"{name}, seed {seed}: " + ", ".join(f"{row[word]} {word}" for word in (*VERDICTS, REFUSED)))
@@ -225,7 +235,7 @@ def of_seed(
 
 
 def families_of(kind: str, chosen: str) -> list[str]:
-    """Families by their names, or those of a group that the kind has."""
+    """Return families by their names, or those of a group that exist for the kind."""
     if chosen not in GROUPS:
         return runner.split_names(chosen, FAMILIES, "family")
     return [name for name in GROUPS[chosen] if kind == "human" or name not in OF_PEOPLE]
@@ -236,16 +246,16 @@ def main(
     kind: Annotated[str, Option(help=f"human, {', '.join(GENERATORS)}")] = "human",
     families: Annotated[str, Option(help=f"names, or one of {', '.join(GROUPS)}")] = "all",
     count: Annotated[int, Option(min=1, help="cases of each family")] = 10,
-    output: Annotated[Path, Option(help="folder of what was measured, and of the picture")] = Path("verdicts"),
-    fit: Annotated[bool, Option("--fit", help="also find the weights of the signs")] = False,
+    output: Annotated[Path, Option(help="folder of results and of the chart")] = Path("verdicts"),
+    fit: Annotated[bool, Option("--fit", help="also fit the weights of the features")] = False,
     threads: runner.Threads = 1,
     seed: runner.Seed = 1,
-    seeds: Annotated[int, Option(min=1, help="so many seeds from that one on, all of which count together")] = 1,
+    seeds: Annotated[int, Option(min=1, help="number of seeds from --seed on, counted together")] = 1,
 ) -> runner.Report:
     names = families_of(kind, families)
     found: list[dict[str, Any]] = []
     for number in range(seed, seed + seeds):
-        found += of_seed(kind, names, count, number, threads, output)
+        found += measure_seed(kind, names, count, number, threads, output)
     mapped = [each for each in found if each["verdict"] != REFUSED]
     steps, auc = calibration(mapped)
     bars, by_family, by_verdict = bars_of(found), rows_of(found, "family", names), rows_of(found, "verdict", VERDICTS)
@@ -262,10 +272,12 @@ def main(
             f"{kind}: verdicts by family, {seeds} seeds from {seed} on", by_family, {"family": "of", **_COLUMNS}
         ),
         runner.table(
-            "In all", [bars | {word: sum(row[word] for row in by_family) for word in ("maps", *VERDICTS)}], _IN_ALL
+            "In all",
+            [bars | {word: sum(row[word] for row in by_family) for word in ("maps", *VERDICTS)}],
+            _TOTAL_COLUMNS,
         ),
         runner.table("By verdict", by_verdict, {"verdict": "of", **_COLUMNS}),
-        runner.table("Confidence of vertices", steps, _STEPS),
+        runner.table("Confidence of vertices", steps, _CONFIDENCE_COLUMNS),
     ]
     notes = [f"confidence: AUC {auc:.3f}, furthest from the truth {furthest:.3f}"]
     record: dict[str, Any] = {"families": by_family, "verdicts": by_verdict, "confidence": steps, "auc": auc, **bars}

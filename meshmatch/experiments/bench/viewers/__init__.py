@@ -1,1 +1,1 @@
-"""Whether what meshmatch writes is opened by others, as it was written."""
+"""Check that other programs open the files that meshmatch writes, with the same content."""

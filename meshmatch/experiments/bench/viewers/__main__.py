@@ -1,14 +1,15 @@
-"""Whether what meshmatch writes is opened by others, as it was written.
+"""Check that other programs open the files that meshmatch writes, with the same content.
 
-Every verb that writes shapes makes its files, of every format, from the samples and the characters of the bench. Khronos'
-validator (npm's gltf-validator) reads each glb; Blender and three.js (npm's, in Chromium) open every file. Their meshes,
-triangles, bones, clips, morph targets and images are counted and compared with what the file holds, and where it lies with
-what meshmatch reads; both draw it, as it lies and in the middle of its first clip with its first blendshape, from one
-place: what they draw should cover the same pixels. The pictures are left in OUTPUT/pictures, with one sheet of all.
+Every command that writes shapes is run for every format, on the samples and the characters of the benchmark. Khronos'
+validator (npm's gltf-validator) checks each glTF file; Blender and three.js (npm's, in Chromium) open every file. The
+meshes, triangles, bones, clips, morph targets and images that they find are compared with the contents of the file, and the
+bounding box with that of the shape that meshmatch reads. Both render it from the same view: at rest, and in the middle of its first
+clip with its first blendshape. The two pictures should cover the same pixels. Pictures are written to OUTPUT/pictures, and
+all together to OUTPUT/sheet.png.
 
-Nothing is installed: `npm install --prefix FOLDER gltf-validator three` and --modules FOLDER/node_modules; Blender as for
-files that it reads (MESHMATCH_BLENDER); Chromium from the path or MESHMATCH_CHROMIUM. Of a target that has issues itself
-only those that it did not have are counted.
+The tools must be installed: `npm install --prefix FOLDER gltf-validator three` and --modules FOLDER/node_modules; Blender as
+for reading files (MESHMATCH_BLENDER); Chromium on the path or named by MESHMATCH_CHROMIUM. Issues that a target file had
+before are not counted.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from meshmatch.experiments.bench.viewers.opened import (
     TOOLS,
     Found,
     check_tools,
-    in_blender,
-    in_three,
     issues,
-    validated,
+    open_in_blender,
+    open_in_three,
+    validate_gltf,
 )
 from meshmatch.experiments.bench.viewers.sheet import covered, draw_sheet, overlap
 from meshmatch.outputs import make_folder
 
 AS_WRITTEN, NO_READER = "as written", "has no reader"
 _GLTF = (".glb", ".gltf", ".vrm")
-_OVERLAP = 0.9  # of the pixels that either covers; the rest are edges
+_MIN_OVERLAP = 0.9  # minimum intersection over union of the covered pixels; silhouettes differ at edges
 COLUMNS = {
     "file": "file", "by": "verb", "errors": "errors:d", "warnings": "warnings:d", "joints": "bones:d", "clips": "clips:d",
     "shapes": "morphs:d", "images": "images:d", "Blender": "blender", "three.js": "three",
@@ -70,14 +71,14 @@ def _rows(files: list[Made], valid: Found | None, opened: dict[str, Found], pict
         if len(opened) == 2 and all(row[tool] == AS_WRITTEN for tool in opened):
             for ending in ("-moved",) if written.begins("three") else ("", "-moved"):
                 both = [pictures / f"{each.path.name}-{tool}{ending}.png" for tool in opened]
-                if all(path.exists() for path in both) and (share := overlap(*both)) < _OVERLAP:
+                if all(path.exists() for path in both) and (share := overlap(*both)) < _MIN_OVERLAP:
                     row["three"] = f"{'moved, ' * bool(ending)}covers {share:.0%} of the same pixels as in Blender"
         rows.append(row)
     return rows
 
 
 def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each verb."""
+    """Summarize the rows by verb."""
     found = []
     for verb in dict.fromkeys(row["verb"] for row in rows):
         some = [row for row in rows if row["verb"] == verb]
@@ -98,7 +99,7 @@ def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 @runner.command
 def main(
-    output: Annotated[Path, Argument(help="a folder for the files; what is there is not made again")],
+    output: Annotated[Path, Argument(help="a folder for the files; existing ones are reused")],
     data: runner.Data = runner.DATA,
     modules: Annotated[Path, Option(help="npm's folder node_modules")] = Path("node_modules"),
     tools: Annotated[str, Option(help=f"of {', '.join(TOOLS)}")] = ",".join(TOOLS),
@@ -113,12 +114,12 @@ def main(
     valid, opened = None, {}
     if "validator" in chosen:
         gltf = {each for one in files for each in (one.path, one.target) if each is not None and each.suffix in _GLTF}
-        valid = validated(sorted(gltf), modules)
+        valid = validate_gltf(sorted(gltf), modules)
     paths = [each.path for each in files]
     if "blender" in chosen:
-        opened["blender"] = in_blender(paths, pictures.absolute())
+        opened["blender"] = open_in_blender(paths, pictures.absolute())
     if "three" in chosen:
-        opened["three"] = in_three([path for path in paths if path.suffix != ".blend"], pictures, modules)
+        opened["three"] = open_in_three([path for path in paths if path.suffix != ".blend"], pictures, modules)
         opened["three"] |= {str(path): {"error": NO_READER} for path in paths if path.suffix == ".blend"}
     rows = _rows(files, valid, opened, pictures)
     draw_sheet(output / "sheet.png", [each.path.name for each in files], pictures)

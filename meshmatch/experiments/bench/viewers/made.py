@@ -1,4 +1,4 @@
-"""One output of every sort that the commands write, made by them from the samples and the bench's characters."""
+"""Make one output of each command and format, from the samples and the characters of the benchmark."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ THROUGH_BLENDER = (".fbx", ".usdz", ".dae", ".blend")
 
 @dataclass(frozen=True)
 class Made:
-    """A file that a command wrote: by which verb, and the file that came back as it, if one did."""
+    """A file written by a command, its verb, and the target file that the output is a modified copy of, if any."""
 
     path: Path
     verb: str
@@ -34,7 +34,7 @@ class Made:
 
 
 def made(folder: Path, data: Path, blender: bool, track: Callable[[Sequence[str]], Sequence[str]]) -> list[Made]:
-    """Run every command of `commands` that is not done yet; those through Blender only where that is there."""
+    """Run the commands of `commands` whose outputs do not exist; formats that need Blender only with ``blender``."""
     inputs = _write_inputs(folder / "inputs", data)
     lines = [line.format(**inputs) for line in commands().splitlines() if line]
     found: list[Made] = []
@@ -49,7 +49,7 @@ def made(folder: Path, data: Path, blender: bool, track: Callable[[Sequence[str]
             raise OutputError(f"meshmatch {shlex.join(words)} ended with status {status}")
         whose = words[1:2] if words[0] == "wrap" else words[2:4]
         back = next((Path(word) for word in whose if Path(word).suffix in (".glb", ".vrm")), None)
-        if output.is_dir() and (files := sorted(output.glob("*.glb"))):  # one of them is enough
+        if output.is_dir() and (files := sorted(output.glob("*.glb"))):  # one file is enough
             output = Path(shutil.copy(files[0], folder / f"{output.name}.glb"))
         if output.suffix not in (".npz", ""):
             found.append(Made(output, words[0], back))
@@ -57,7 +57,7 @@ def made(folder: Path, data: Path, blender: bool, track: Callable[[Sequence[str]
 
 
 def commands() -> str:
-    """What is run: a line each; "@" stands before what a line above made."""
+    """Return the commands, one per line; "@" marks the outputs of previous lines."""
     return """
 match {dancer} {climber} -o body.npz
 match {fox} {other_fox} -o fox.npz
@@ -98,7 +98,7 @@ export @fits -o export --format glb
 
 
 def _write_inputs(folder: Path, data: Path) -> dict[str, str]:
-    """Files to transfer, by the names that commands call them; made where they are not there."""
+    """Write missing input files; return their paths by the names that commands use."""
     samples, rigs = bundled_folder() / "samples", data / "rigs"
     found = {
         "dancer": samples / "dancer-textured.glb", "climber": samples / "climber.ply", "other_fox": samples / "fox.ply",
@@ -136,7 +136,7 @@ def _write_inputs(folder: Path, data: Path) -> dict[str, str]:
 
 
 def _as_vrm(path: Path) -> bytes:
-    """A character with the extension of VRM 1.0 that says which bones are a person's."""
+    """Add to a character the extension of VRM 1.0 that names the bones of a humanoid."""
     document = Document(path, path.read_bytes())
     editor = Editor(document)
     names = [node.get("name") for node in document.nodes]

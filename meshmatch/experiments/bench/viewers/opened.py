@@ -1,4 +1,4 @@
-"""Khronos' validator, Blender and three.js, each as a process of its own, and what they find in files."""
+"""Run Khronos' validator, Blender and three.js as subprocesses, and collect what they find in files."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ TOOLS = ("validator", "blender", "three")
 HERE = Path(__file__).parent
 _CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _VARIABLE = "MESHMATCH_CHROMIUM"
-_SWITCHES = (
+_CHROMIUM_OPTIONS = (
     *("--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-extensions"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),  # WebGL without a graphics card
 )
-_SECONDS = 900.0
+_TIMEOUT = 900.0
 _MODULES = {"validator": "gltf-validator", "three": "three"}
 Found = dict[str, dict[str, Any]]
-"""What was found in each file, by its name: a record, or why it could not be opened (``error``)."""
+"""Record of each file by its path: what was found, or ``error``, why it could not be opened."""
 
 
 def check_tools(tools: Sequence[str], modules: Path) -> None:
-    """Refuse (`OptionError`), before any work, what is asked for and not there."""
+    """Raise `OptionError` for tools that are not installed."""
     for tool, package in _MODULES.items():
         if tool in tools and not (modules / package / "package.json").is_file():
             hint = (
@@ -61,12 +61,12 @@ def _chromium() -> str:
     return found
 
 
-def validated(files: Sequence[Path], modules: Path) -> Found:
-    """The issues that Khronos' validator has with glTF files: severity 0 is an error, 1 a warning."""
+def validate_gltf(files: Sequence[Path], modules: Path) -> Found:
+    """Validate glTF files by Khronos' validator; severity 0 of an issue is an error, 1 a warning."""
     if not files:
         return {}
     words = ["node", str(HERE / "validate.cjs"), str(modules.absolute()), *map(str, files)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=_SECONDS, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
     if done.returncode:
         raise InputError(
             f"Khronos' validator ended with status {done.returncode}", (done.stderr.splitlines() or [""])[-1]
@@ -76,7 +76,7 @@ def validated(files: Sequence[Path], modules: Path) -> Found:
 
 
 def issues(found: Found, file: Path, target: Path | None = None) -> Counter[tuple[int, str]]:
-    """Errors and warnings of a file, by severity and code, that its target does not have."""
+    """Count errors and warnings of a file, by severity and code, without those of the target that it was made from."""
 
     def of(path: Path) -> Counter[tuple[int, str]]:
         record = found[str(path)]
@@ -86,8 +86,8 @@ def issues(found: Found, file: Path, target: Path | None = None) -> Counter[tupl
     return of(file) - (Counter() if target is None else of(target))
 
 
-def in_blender(files: Sequence[Path], pictures: Path) -> Found:
-    """What Blender finds in files, each in a new scene; it goes on behind one that it crashes on."""
+def open_in_blender(files: Sequence[Path], pictures: Path) -> Found:
+    """Open files in Blender, each in a new scene; it is restarted after a file that crashes it."""
     found: Found = {}
     while left := [file for file in files if str(file) not in found]:
         words = [
@@ -96,7 +96,7 @@ def in_blender(files: Sequence[Path], pictures: Path) -> Found:
             "--",
             *map(str, [pictures, *left]),
         ]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=_SECONDS, check=False)
+        done = subprocess.run(words, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
         records = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"file"')]
         found |= {str(Path(record.pop("file"))): record for record in records}
         if len(records) < len(left):
@@ -105,10 +105,12 @@ def in_blender(files: Sequence[Path], pictures: Path) -> Found:
 
 
 class _Page(SimpleHTTPRequestHandler):
-    """Serves the page, three.js and the files of one folder to one browser, and takes what the page tells."""
+    """HTTP handler that serves the page, three.js and a folder of files, and collects the records that the page posts."""
 
-    def __init__(self, *words: Any, files: Sequence[Path], modules: Path, told: Found, done: threading.Event) -> None:
-        self.files, self.modules, self.told, self.done = files, modules, told, done
+    def __init__(
+        self, *words: Any, files: Sequence[Path], modules: Path, records: Found, done: threading.Event
+    ) -> None:
+        self.files, self.modules, self.records, self.done = files, modules, records, done
         super().__init__(*words)
 
     def translate_path(self, path: str) -> str:
@@ -129,7 +131,7 @@ class _Page(SimpleHTTPRequestHandler):
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         if self.path == "/told":
             record = json.loads(body)
-            self.told[record.pop("file")] = record
+            self.records[record.pop("file")] = record
         self._answer(b"")
         if self.path == "/done":
             self.done.set()
@@ -141,7 +143,7 @@ class _Page(SimpleHTTPRequestHandler):
         self.wfile.write(data)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: what matters is told."""
+        """Do not log requests."""
 
 
 @contextmanager
@@ -156,25 +158,25 @@ def _served(handler: Any) -> Iterator[str]:
             thread.join()
 
 
-def in_three(files: Sequence[Path], pictures: Path, modules: Path) -> Found:
-    """What three.js finds in files of one folder, in a browser without a window."""
-    told: Found = {}
+def open_in_three(files: Sequence[Path], pictures: Path, modules: Path) -> Found:
+    """Open files of one folder in three.js, in a headless browser."""
+    records: Found = {}
     done = threading.Event()
-    handler = partial(_Page, files=files, modules=modules.absolute(), told=told, done=done)
+    handler = partial(_Page, files=files, modules=modules.absolute(), records=records, done=done)
     with _served(handler) as address, tempfile.TemporaryDirectory(prefix="meshmatch-") as profile:
-        words = [_chromium(), *_SWITCHES, f"--user-data-dir={profile}", address]
+        words = [_chromium(), *_CHROMIUM_OPTIONS, f"--user-data-dir={profile}", address]
         browser = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             waited = 0.0
-            while not done.wait(0.5) and browser.poll() is None and waited < _SECONDS:
+            while not done.wait(0.5) and browser.poll() is None and waited < _TIMEOUT:
                 waited += 0.5
         finally:
             browser.terminate()
             browser.wait()
-    for name, record in told.items():
+    for name, record in records.items():
         for key, ending in (("picture", ""), ("picture_moved", "-moved")):
             if (picture := record.pop(key, None)) is not None:
                 data = base64.b64decode(picture.partition(",")[2])
                 (pictures / f"{name}-three{ending}.png").write_bytes(data)
     lost = {"error": "the browser ended before"}
-    return {str(file): told.get(file.name, lost) for file in files}
+    return {str(file): records.get(file.name, lost) for file in files}

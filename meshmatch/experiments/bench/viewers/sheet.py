@@ -1,4 +1,4 @@
-"""Pictures of files, as others draw them: what they cover, and all of them on one sheet."""
+"""Pictures of files rendered by other programs: comparison of covered pixels, and one sheet of all pictures."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from PIL import Image, ImageDraw
 from meshmatch.arrays import Bools
 
 ENDINGS = ("-blender", "-three", "-blender-moved", "-three-moved")
-_SIZE, _LINE, _ROW = 200, 14, 2  # pixels; files side by side
+_SIZE, _TITLE_HEIGHT, _FILES_PER_ROW = 200, 14, 2  # size of a picture and height of a title in pixels; files per row
 
 
 def mask(path: Path) -> Bools:
-    """Which pixels (H, W) of a picture with a transparent ground something covers."""
+    """Return the covered pixels (H, W) of a picture with a transparent background."""
     return np.asarray(Image.open(path).convert("RGBA"))[:, :, 3] > 127
 
 
 def covered(path: Path) -> float:
-    """The share of a picture that something covers."""
+    """Return the covered share of a picture."""
     return float(mask(path).mean())
 
 
 def overlap(one: Path, other: Path) -> float:
-    """The pixels that both pictures cover, of those that either does."""
+    """Compute the intersection over union of the covered pixels of two pictures."""
     a, b = mask(one), mask(other)
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
 def draw_sheet(path: Path, names: Sequence[str], pictures: Path) -> None:
-    """For each file Blender and three.js side by side, as it lies and moved, two files a row."""
+    """Draw one sheet with the pictures of each file by Blender and three.js, at rest and moved, two files per row."""
     wide = len(ENDINGS) * _SIZE
-    rows = -(-len(names) // _ROW)
-    sheet = Image.new("RGB", (_ROW * wide, rows * (_SIZE + _LINE)), "white")
+    rows = -(-len(names) // _FILES_PER_ROW)
+    sheet = Image.new("RGB", (_FILES_PER_ROW * wide, rows * (_SIZE + _TITLE_HEIGHT)), "white")
     pen = ImageDraw.Draw(sheet)
     for k, name in enumerate(names):
-        x, y = k % _ROW * wide, k // _ROW * (_SIZE + _LINE)
+        x, y = k % _FILES_PER_ROW * wide, k // _FILES_PER_ROW * (_SIZE + _TITLE_HEIGHT)
         pen.text((x + 2, y), name, fill="black")
         for j, ending in enumerate(ENDINGS):
             file = pictures / f"{name}{ending}.png"
             if file.exists():
                 picture = Image.open(file).convert("RGBA").resize((_SIZE, _SIZE))
-                sheet.paste(picture, (x + j * _SIZE, y + _LINE), picture)
+                sheet.paste(picture, (x + j * _SIZE, y + _TITLE_HEIGHT), picture)
     sheet.save(path)

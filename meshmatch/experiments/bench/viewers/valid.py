@@ -1,5 +1,6 @@
-"""Whether Khronos' validator finds no error and no warning in the glb files of a folder, such as those that tests wrote
-(MESHMATCH_KEEP_GLB=FOLDER pytest).
+"""Check the glb files of a folder with Khronos' validator for errors and warnings.
+
+Tests write their files to a folder with MESHMATCH_KEEP_GLB=FOLDER.
 """
 
 from __future__ import annotations
@@ -11,19 +12,21 @@ from typer import Argument, Option
 
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.viewers.opened import Found, check_tools, issues, validated
+from meshmatch.experiments.bench.viewers.opened import Found, check_tools, issues, validate_gltf
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_vrm import is_character
 
-_OF_VRM = {"INVALID_EXTENSION_NAME_FORMAT", "MULTIPLE_EXTENSIONS"}
-"""What characters are told of, for that is how VRM has it: an extension called VRM, and a toon material that is plain where
-nobody knows it.
+_VRM_ISSUES = {"INVALID_EXTENSION_NAME_FORMAT", "MULTIPLE_EXTENSIONS"}
+"""Issues that are inherent in VRM characters: the name of the extension VRM, and toon materials with a fallback for
+viewers that do not know them.
 """
 
 
 def _codes(found: Found, file: Path) -> set[str]:
     codes = {code for _, code in issues(found, file)}
-    return codes - _OF_VRM if codes & _OF_VRM and is_character(Document(file, file.read_bytes()).json) else codes
+    return (
+        codes - _VRM_ISSUES if codes & _VRM_ISSUES and is_character(Document(file, file.read_bytes()).json) else codes
+    )
 
 
 @runner.command
@@ -33,12 +36,12 @@ def main(
 ) -> runner.Report:
     check_tools(["validator"], modules)
     files = runner.files_in(folder, "*.glb")
-    found = validated(files, modules)
+    found = validate_gltf(files, modules)
     rows = [{"file": file.name, "issues": ", ".join(sorted(_codes(found, file)))} for file in files]
     bad = [row for row in rows if row["issues"]]
     tables = [runner.table("With errors or warnings", bad, {"file": "file", "issues": "issues:<"})] if bad else []
     stopped = (
         InputError(f"{len(bad)} of {len(files)} files have errors or warnings", "they are named above") if bad else None
     )
-    told = f"{len(files)} files, {len(files) - len(bad)} without errors and warnings"
-    return runner.Report({"files": len(files), "bad": bad}, tables, [told], stopped)
+    note = f"{len(files)} files, {len(files) - len(bad)} without errors and warnings"
+    return runner.Report({"files": len(files), "bad": bad}, tables, [note], stopped)

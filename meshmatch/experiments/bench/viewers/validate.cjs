@@ -1,4 +1,4 @@
-// node validate.cjs FOLDER FILE ...: Khronos' validator, from a folder of npm's modules, on each file; a line of JSON each.
+// node validate.cjs FOLDER FILE ...: runs Khronos' validator, from npm's folder of modules, on each file; prints JSON lines.
 const fs = require("fs");
 const path = require("path");
 const [modules, ...files] = process.argv.slice(2);

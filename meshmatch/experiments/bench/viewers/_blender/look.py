@@ -1,8 +1,8 @@
-"""Run by Blender: files are imported, counted, measured and rendered, as they lie and as they move.
+"""Script for Blender: import files, count and measure their contents, and render them at rest and moved.
 
     python look.py PICTURES FILE ...
 
-A line of JSON to stdout for each file; its pictures are PICTURES/NAME-blender.png and NAME-blender-moved.png.
+It prints a line of JSON for each file, and writes PICTURES/NAME-blender.png and NAME-blender-moved.png.
 """
 
 import json
@@ -42,14 +42,14 @@ def meshes():
 
 
 def animated():
-    """All that may have actions: objects and the shape keys of their meshes."""
+    """Return objects and shape keys with animation data."""
     found = list(bpy.context.scene.objects)
     found += [each.data.shape_keys for each in meshes() if each.data.shape_keys]
     return [each for each in found if each.animation_data]
 
 
 def clips():
-    """Names of actions, or of the tracks that they stand in, with who plays what."""
+    """Return clips by name, of the NLA track or the action: (animated object or shape keys, action, slot) of each."""
     found = {}
     for each in animated():
         data = each.animation_data
@@ -60,7 +60,7 @@ def clips():
         if data.action and not any(data.action == act for them in found.values() for _, act, _ in them):
             found.setdefault(data.action.name, []).append((each, data.action, getattr(data, "action_slot", None)))
     used = {action for them in found.values() for _, action, _ in them}
-    for action in bpy.data.actions:  # an fbx has one of its clips on its skeleton, and the others beside it
+    for action in bpy.data.actions:  # of the clips of an fbx only one is assigned to the skeleton
         if action not in used and found:
             first = next(iter(found.values()))[0]
             found[action.name] = [(first[0], action, next(iter(getattr(action, "slots", ())), None))]
@@ -68,7 +68,7 @@ def clips():
 
 
 def box():
-    """The corners of what is seen, in the axes of glTF."""
+    """Return the bounding box of the visible meshes, in the axes of glTF."""
     graph = bpy.context.evaluated_depsgraph_get()
     low, high = [math.inf] * 3, [-math.inf] * 3
     for each in meshes():
@@ -82,7 +82,7 @@ def box():
     return [low, high]
 
 
-def counted():
+def count_contents():
     found = [each for each in meshes() if each.data.shape_keys]
     keys = sum(len(each.data.shape_keys.key_blocks) - 1 for each in found)
     bones = {bone.name for each in bpy.context.scene.objects if each.type == "ARMATURE" for bone in each.data.bones}
@@ -100,8 +100,8 @@ def counted():
     }
 
 
-def light(corners):
-    """A camera to the left of the front, and lamps, for what lies between two corners (Blender's axes)."""
+def set_up_scene(corners):
+    """Set up a camera, front left, and lights for a bounding box in the axes of glTF."""
     scene = bpy.context.scene
     for each in [each for each in scene.objects if each.type in ("CAMERA", "LIGHT")]:
         bpy.data.objects.remove(each)
@@ -140,7 +140,7 @@ def render(path):
 
 
 def move():
-    """Half of the first clip, and the first shape key of each mesh; whether anything moved."""
+    """Set the middle of the first clip and the first shape key of each mesh; return whether there is any."""
     playing = clips()
     for name in sorted(playing)[:1]:
         start, stop = playing[name][0][1].frame_range
@@ -159,34 +159,34 @@ def move():
     return bool(playing or keyed)
 
 
-def look(path, pictures):
+def inspect_file(path, pictures):
     read(path)
     if not meshes():
         raise ValueError("there is no mesh in it")
     skeletons = [each for each in bpy.context.scene.objects if each.type == "ARMATURE"]
-    for each in skeletons:  # as it lies: clips play from the beginning
+    for each in skeletons:  # otherwise the first frame of a clip is shown
         each.data.pose_position = "REST"
     bpy.context.view_layer.update()
-    found = counted()
+    found = count_contents()
     stem = os.path.join(pictures, os.path.basename(path))
-    light(found["box"])
+    set_up_scene(found["box"])
     render(f"{stem}-blender.png")
     for each in skeletons:
         each.data.pose_position = "POSE"
     if move():
         found["box_moved"] = box()
-        light(found["box_moved"])
+        set_up_scene(found["box_moved"])
         render(f"{stem}-blender-moved.png")
     return found
 
 
 words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
-told = os.fdopen(os.dup(1), "w")
-os.dup2(2, 1)  # what Blender says goes to stderr
+output = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)  # Blender's own output goes to stderr
 for each in words[1:]:
     try:
-        record = look(each, words[0])
+        record = inspect_file(each, words[0])
     except Exception as error:
         record = {"error": str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__}
-    print(json.dumps({"file": each} | record), file=told, flush=True)
+    print(json.dumps({"file": each} | record), file=output, flush=True)
 os._exit(0)
