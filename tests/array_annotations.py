@@ -1,9 +1,9 @@
-"""Check the types and shapes that annotations promise of arrays, at every call while tests run.
+"""Check the types and shapes of array annotations at every call while tests run.
 
-`install`, called by ``conftest.py`` before anything is imported, wraps functions with jaxtyping annotations as their
-module is loaded. Other annotations are left to mypy, and constructors too: dataclasses convert what they are given.
-Annotations are read once for each function, for some are called many thousand times: jaxtyping's own check of a call
-makes tests of fits take nearly twice as long.
+`install`, called by ``conftest.py`` before anything is imported, wraps functions with jaxtyping annotations when their
+module is loaded. Other annotations are left to mypy. So are constructors, as dataclasses convert their arguments.
+Annotations are parsed once for each function, as some functions are called many thousand times: with jaxtyping's own check
+tests of fits take nearly twice as long.
 """
 
 import inspect
@@ -19,12 +19,12 @@ from jaxtyping import AbstractArray
 
 Sizes = dict[str, Any]
 Check = Callable[[Any, Sizes], bool]
-"""Whether a value is what an annotation says, given the sizes that names have in this call; notes those of new names."""
+"""Predicate: whether a value matches an annotation, given the sizes of named axes in this call; adds sizes of new names."""
 ARRAYS = ("Float[", "Int[", "Bool[", "UInt8[")
 
 
 def install(packages: Sequence[str]) -> None:
-    """Check the functions of all modules in these packages that are loaded from now on."""
+    """Check the functions of all modules of these packages that are loaded from now on."""
     sys.meta_path.insert(0, _Finder(tuple(packages)))
 
 
@@ -49,28 +49,28 @@ class _Loader(SourceFileLoader):
         classes = [value for value in vars(module).values() if inspect.isclass(value)]
         for holder in (module, *(each for each in classes if each.__module__ == module.__name__)):
             for name, value in list(vars(holder).items()):
-                if inspect.isfunction(value) and value.__module__ == module.__name__ and _promises(value):
+                if inspect.isfunction(value) and value.__module__ == module.__name__ and _has_array_annotations(value):
                     setattr(holder, name, checked(value))
 
 
-def _promises(function: Callable[..., Any]) -> bool:
-    arrays = any(_is_of_arrays(hint) for hint in function.__annotations__.values())
+def _has_array_annotations(function: Callable[..., Any]) -> bool:
+    arrays = any(_is_array_annotation(hint) for hint in function.__annotations__.values())
     return arrays and function.__name__ != "__init__" and not inspect.isgeneratorfunction(function)
 
 
-def _is_of_arrays(hint: Any) -> bool:
+def _is_array_annotation(hint: Any) -> bool:
     return any(kind in str(hint) for kind in ARRAYS)
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function, which raises `TypeError` for arrays that are not what its annotations say."""
+    """Wrap a function to raise `TypeError` for arrays that do not match its annotations."""
     order = list(inspect.signature(function).parameters)
     checks: dict[str, Check] | None = None
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         nonlocal checks
-        if checks is None:  # not before, for modules may import each other for annotations
+        if checks is None:  # not earlier, as annotations may need circular imports
             checks = dict(_checks(function))
         sizes: Sizes = {}
         for given in (zip(order, args, strict=False), kwargs.items()):
@@ -89,17 +89,17 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _checks(function: Callable[..., Any]) -> Iterator[tuple[str, Check]]:
     for name, hint in function.__annotations__.items():
-        if _is_of_arrays(hint):
+        if _is_array_annotation(hint):
             try:
                 found = _check_of(eval(hint, function.__globals__) if isinstance(hint, str) else hint)
-            except (AttributeError, NameError, TypeError):  # with names that are for type checkers alone
+            except (AttributeError, NameError, TypeError):  # names imported for type checkers only
                 continue
             if found is not None:
                 yield name, found
 
 
 def _check_of(hint: Any) -> Check | None:
-    """None for what is not checked."""
+    """Return the check of an annotation; None if it is not checked."""
     if inspect.isclass(hint) and issubclass(hint, AbstractArray):
         return _array_check(hint)
     inner = get_args(hint)
@@ -110,7 +110,7 @@ def _check_of(hint: Any) -> Check | None:
         optional = type(None) in inner
         return lambda value, sizes: optional if value is None else any(check(value, sizes) for check in checks)
     if get_origin(hint) is tuple and Ellipsis not in inner:
-        each = [_check_of(part) or _anything for part in inner]
+        each = [_check_of(part) or _accept_anything for part in inner]
         return lambda value, sizes: (
             isinstance(value, tuple)
             and len(value) == len(each)
@@ -119,7 +119,7 @@ def _check_of(hint: Any) -> Check | None:
     return None
 
 
-def _anything(value: Any, sizes: Sizes) -> bool:
+def _accept_anything(value: Any, sizes: Sizes) -> bool:
     return True
 
 
@@ -127,7 +127,7 @@ def _array_check(hint: Any) -> Check:
     kind, kinds = hint.array_type, set(hint.dtypes)
     dims: list[str | int] = [int(word) if word.isdigit() else word for word in hint.dim_str.split()]
     many = next((at for at, dim in enumerate(dims) if isinstance(dim, str) and dim.startswith(("*", "..."))), None)
-    seen: set[Any] = set()  # types of elements that are among the kinds
+    seen: set[Any] = set()  # accepted dtypes
 
     def check(value: Any, sizes: Sizes) -> bool:
         if not isinstance(value, kind):
@@ -139,7 +139,9 @@ def _array_check(hint: Any) -> Check:
         shape, wanted = tuple(value.shape), dims
         if many is not None:
             after = len(dims) - many - 1
-            if len(shape) < many + after or not _fits(str(dims[many]), shape[many : len(shape) - after], sizes):
+            if len(shape) < many + after or not _variadic_axes_match(
+                str(dims[many]), shape[many : len(shape) - after], sizes
+            ):
                 return False
             shape = shape[:many] + shape[len(shape) - after :]
             wanted = dims[:many] + dims[many + 1 :]
@@ -156,8 +158,8 @@ def _array_check(hint: Any) -> Check:
     return check
 
 
-def _fits(dim: str, shape: tuple[int, ...], sizes: Sizes) -> bool:
-    """Whether axes of any number are those of the same name: ``*#B`` may be broadcast to them, ``...`` are any."""
+def _variadic_axes_match(dim: str, shape: tuple[int, ...], sizes: Sizes) -> bool:
+    """Return whether variadic axes match those of the same name: ``*#B`` may broadcast to them, ``...`` matches any."""
     if dim == "...":
         return True
     before = sizes.setdefault(dim.replace("#", ""), shape)

@@ -1,4 +1,4 @@
-"""Whether Blender is here, and a program that stands in for it."""
+"""Detection of Blender for tests, and a fake program in its place."""
 
 import os
 import stat
@@ -26,7 +26,7 @@ needs_blender = pytest.mark.skipif(not found(), reason=f"needs Blender ({blender
 
 
 def run_inside(script: Path, *words: str | Path) -> str:
-    """What a script says that Blender runs; it takes its words from behind "--"."""
+    """Run a script in Blender with arguments after "--"; return its stdout."""
     call = [*blender.command("any.blend"), str(script), "--", *map(str, words)]
     done = subprocess.run(call, capture_output=True, text=True, timeout=SECONDS)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -34,7 +34,7 @@ def run_inside(script: Path, *words: str | Path) -> str:
 
 
 def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str = "shutil.copyfile(source, output)") -> None:
-    """Let a program be taken for Blender that has its words and does something with them, in Python."""
+    """Install a fake Blender that runs the Python statement ``does`` with the variables ``source`` and ``output``."""
     program = folder / ("blender.cmd" if os.name == "nt" else "blender")
     source = (
         f"#!{sys.executable}\nimport shutil, sys, time\nsource, output = sys.argv[sys.argv.index('--') + 1 :]\n{does}\n"

@@ -1,4 +1,4 @@
-"""Small shapes made of nothing but NumPy, fits that tests share, and the evaluation data where it is there."""
+"""Fixtures for all tests: small shapes, shared fits, and the evaluation data if it is available."""
 
 import base64
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: many small products, in several processes
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: tests have many small products, in several processes
 
 import numpy as np
 import pytest
@@ -27,15 +27,16 @@ from meshmatch.shapes.shape import Shape  # noqa: E402
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules with slow tests first, so that no process is still busy with one when the others are done."""
+    """Run modules with slow tests first, so that no process is still busy with one when the others are done."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def kept_glb() -> Iterator[None]:
-    """With MESHMATCH_KEEP_GLB=FOLDER, keep every glb that the package makes there, each once, for
-    `meshmatch.experiments.bench.viewers.valid` to read.
+    """With MESHMATCH_KEEP_GLB=FOLDER, save every distinct glb that the package makes in that folder.
+
+    `meshmatch.experiments.bench.viewers.valid` validates them.
     """
     if not (named := os.environ.get("MESHMATCH_KEEP_GLB")):
         yield
@@ -64,16 +65,16 @@ def kept_glb() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all processes of one run share."""
+    """A folder shared by all processes of a test run."""
     own = tmp_path_factory.getbasetemp()
     return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
 
 
 @contextmanager
 def remembering(folder: Path) -> Iterator[Callable[..., Any]]:
-    """Fit no shape with the same model and choices twice: `folder` keeps the fits, for other tests and processes.
+    """Cache fits in `folder`, by model, settings and shape, for all tests and processes.
 
-    Gives the method that fits without remembering.
+    Yield the original method, which does not use the cache.
     """
     from meshmatch.fitting.fitter import Fitter
 
@@ -95,14 +96,14 @@ def remembering(folder: Path) -> Iterator[Callable[..., Any]]:
 
 @pytest.fixture(scope="module")
 def remembered_fits(run_folder: Path) -> Iterator[Callable[..., Any]]:
-    """For modules whose tests ask what comes after a fit, or about fits that others ask about too."""
+    """Cache the fits of a module, for tests that only use fits or share them with other tests; see `remembering`."""
     with remembering(run_folder) as fit:
         yield fit
 
 
 @pytest.fixture(scope="session")
 def bench() -> Path:
-    """The folder of evaluation data beside the repository; tests that need it are skipped without it."""
+    """The folder of evaluation data next to the repository; tests that need it are skipped without it."""
     folder = Path(__file__).resolve().parents[2] / "shared" / "bench"
     if not folder.is_dir():
         pytest.skip(f"no evaluation data at {folder}")
@@ -111,7 +112,7 @@ def bench() -> Path:
 
 @pytest.fixture(scope="session")
 def cube() -> Shape:
-    """The unit cube [0, 1]^3: 8 vertices, 12 triangles, outward."""
+    """The unit cube [0, 1]^3: 8 vertices, 12 outward triangles."""
     verts = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return Shape(verts, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]), "cube")
@@ -119,19 +120,19 @@ def cube() -> Shape:
 
 @pytest.fixture(scope="session")
 def make_sphere() -> Callable[[int], Shape]:
-    """Unit spheres: an icosahedron whose triangles are split in four as often as asked."""
+    """Function that makes unit spheres: an icosahedron whose triangles are split in four a number of times."""
     return icosphere
 
 
 @pytest.fixture(scope="session")
 def sphere() -> Shape:
-    """The unit sphere: 642 vertices, 1280 triangles, outward."""
+    """The unit sphere: 642 vertices, 1280 outward triangles."""
     return icosphere(3)
 
 
 @pytest.fixture(scope="session")
 def torus() -> Shape:
-    """Radii 1 and 0.4 around the z axis: 1600 vertices, 3200 triangles, outward."""
+    """A torus of radii 1 and 0.4 around the z axis: 1600 vertices, 3200 outward triangles."""
     n, m = 50, 32
     u, v = np.meshgrid(np.arange(n) * 2 * np.pi / n, np.arange(m) * 2 * np.pi / m, indexing="ij")
     ring = 1 + 0.4 * np.cos(v)
@@ -144,7 +145,7 @@ def torus() -> Shape:
 
 
 def some_fit(points: np.ndarray, faces: np.ndarray, **about: Any) -> Fit:
-    """A good fit that nobody made: in the frame of its file, resting where it lies, unless `about` says otherwise."""
+    """A made-up good fit with `points` as rest template, in the frame of its file; `about` replaces fields."""
     plain: dict[str, Any] = {"template_hash": "", "frame": Frame.identity(), "vectors": points, "resting": points}
     plain |= {"residual": 0.0, "verts": points, "verdict": "good", "reasons": ()}
     plain |= {"up": "+y", "front": "+z", "seconds": 0.0, "seed": 0}
@@ -152,7 +153,7 @@ def some_fit(points: np.ndarray, faces: np.ndarray, **about: Any) -> Fit:
 
 
 def icosphere(splits: int) -> Shape:
-    """The unit sphere with 20 * 4^splits triangles, outward."""
+    """Build a unit sphere of 20 * 4^splits outward triangles."""
     g = (1 + 5**0.5) / 2
     verts = np.array(
         [
@@ -179,7 +180,7 @@ def icosphere(splits: int) -> Shape:
 
 
 def vtp_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The numbers that a .vtp of ours has at its points."""
+    """Read the point data arrays of a .vtp file that this package wrote."""
     found = {}
     for each in ElementTree.parse(path).iterfind(".//PointData/DataArray"):
         kind = {"Float64": "f8", "Int64": "i8", "Int32": "i4"}[str(each.get("type"))]

@@ -1,4 +1,4 @@
-"""How time grows with the size of what is worked on: seconds depend on the machine and what else it does, ratios little."""
+"""Checks of time complexity by ratios of times, which depend on the machine and its load less than seconds do."""
 
 import gc
 import time
@@ -6,28 +6,28 @@ from collections.abc import Callable
 from typing import TypeVar
 
 Found = TypeVar("Found")
-_LESS = 8
-_MOST = 2 * _LESS  # with the square: 64
+_FACTOR = 8
+_MAX_RATIO = 2 * _FACTOR  # quadratic growth would give 64
 _TRIES = 4
 
 
 def grows_with_size(prepared: Callable[[int], Callable[[], Found]], size: int) -> Found:
-    """What work on so many things gives, if it takes no more than twice as long per thing as on an eighth of them.
+    """Assert that time grows about linearly, and return the result for ``size``.
 
-    ``prepared`` makes what is worked on, outside the clock. Other work on the machine may disturb a measurement: the
-    best of several counts.
+    ``prepared`` makes the work for a size; it is not timed. The work for ``size`` may take at most twice as long per item
+    as for an eighth of it. Other processes may disturb a measurement, so the best of several tries counts.
     """
     ratios: list[float] = []
     while len(ratios) < _TRIES:
-        few, found = _timed(prepared(size // _LESS))[0], _timed(prepared(size))
-        ratios.append(found[0] / few)
-        if ratios[-1] < _MOST:
+        baseline, found = _timed(prepared(size // _FACTOR))[0], _timed(prepared(size))
+        ratios.append(found[0] / baseline)
+        if ratios[-1] < _MAX_RATIO:
             return found[1]
-    raise AssertionError(f"{_LESS} times as many take {min(ratios):.0f} times as long")
+    raise AssertionError(f"{_FACTOR} times as many take {min(ratios):.0f} times as long")
 
 
 def _timed(work: Callable[[], Found]) -> tuple[float, Found]:
-    gc.disable()  # what it goes through is all that other tests left
+    gc.disable()  # collection would traverse the objects of all earlier tests
     try:
         began = time.process_time()
         found = work()

@@ -1,6 +1,6 @@
-"""What a user's own script may look like; mypy, which checks it with the package, knows all its types.
+"""A sample user script for type checking: mypy checks it together with the package.
 
-Every public name is in it (`test_public_names.py`). It is not run.
+It uses every public name (`test_public_names.py`) and is not run.
 """
 
 import warnings

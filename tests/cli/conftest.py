@@ -1,4 +1,4 @@
-"""The command line as its users meet it: words in, a status, stdout and stderr out."""
+"""Fixtures that run the command line: arguments in; status, stdout and stderr out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from tests.conftest import some_fit
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures whose size is not given are small: rays cost seconds."""
+    """Make the default size of pictures small: ray casting takes seconds."""
     monkeypatch.setattr("meshmatch.render.picture.HEIGHT", 160)
 
 
@@ -38,13 +38,13 @@ Run = Callable[..., Answer]
 
 
 def well(answer: Answer) -> Answer:
-    """The same answer, of a command that went well."""
+    """Assert that a command succeeded, and return its answer."""
     assert answer.status == 0, answer.err
     return answer
 
 
 def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
-    """An error in a line, a hint if there is one, status 1, and nothing new in the folder."""
+    """Assert that a command failed: status 1, one line of error, at most one hint, and no new files in the folder."""
     assert answer.status == 1, answer.err
     assert [line.partition(":")[0] for line in answer.err.splitlines()] in (["error", "hint"], ["error"]), answer.err
     assert words in answer.err
@@ -54,7 +54,7 @@ def refused(answer: Answer, words: str, folder: Path, before: set[str]) -> None:
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run the program through its only door."""
+    """Function that runs the program through `main`."""
     monkeypatch.delenv("MESHMATCH_DEBUG", raising=False)
 
     def call(*words: str | Path) -> Answer:
@@ -68,7 +68,7 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def two(tmp_path: Path, sphere: Shape, torus: Shape) -> tuple[Path, Path]:
-    """Files of two shapes: a.ply (642 vertices) and b.ply (1600 vertices)."""
+    """Files of two shapes: a.ply (sphere, 642 vertices) and b.ply (torus, 1600 vertices)."""
     files = tmp_path / "a.ply", tmp_path / "b.ply"
     save_shape(files[0], sphere)
     save_shape(files[1], torus)
@@ -76,7 +76,7 @@ def two(tmp_path: Path, sphere: Shape, torus: Shape) -> tuple[Path, Path]:
 
 
 def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (), **other: Any) -> Fit:
-    """A fit that nobody made: of two triangles."""
+    """A made-up fit of a template of two triangles."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     rest: dict[str, Any] = {"frame": Frame(2.0, np.eye(3), np.array([10.0, 0, 0])), "front": "-z", "residual": 0.0123}
     rest["regularity"] = Regularity(0.001, 0.25)
@@ -85,14 +85,14 @@ def fake_fit(shape: Shape, verdict: str = "good", reasons: tuple[str, ...] = (),
 
 
 def nearest_map(source: Shape, target: Shape, **about: Any) -> VertexMap:
-    """Some map: vertex i goes to vertex i, round and round."""
+    """A made-up map: vertex i to vertex i modulo the number of target vertices."""
     return VertexMap.between(
         source, target, np.arange(source.V) % target.V, **{"confidence": np.ones(source.V)} | about
     )
 
 
 class FakeMatching:
-    """Stands for the matching: remembers how it was called, and answers at once."""
+    """Fake of the matching that records its arguments and returns made-up results at once."""
 
     def __init__(self) -> None:
         self.called: dict[str, Any] = {}
@@ -131,7 +131,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> FakeMatching:
 
 @pytest.fixture
 def no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever is wrong is told before anything is fitted."""
+    """Fail if a fit begins: errors must be reported before."""
 
     def begun(*_: object, **__: object) -> None:
         raise AssertionError("a fit began")

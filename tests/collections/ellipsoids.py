@@ -1,6 +1,6 @@
-"""Registered shapes whose mean and modes are known: ellipsoids that differ in their three half axes alone.
+"""Registered shapes with known mean and modes: ellipsoids that differ only in their three semi-axes.
 
-Stretching along the axes turns nothing and moves no center, so that laying them over one another changes nothing.
+Scaling along the axes has no rotation and keeps the center, so that aligning the shapes changes nothing.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ class Ellipsoids:
 
 
 def ellipsoids(count: int, *, seed: int = 0, splits: int = 2, spread: np.ndarray = SPREAD) -> Ellipsoids:
-    """Shapes whose half axes vary independently."""
+    """Draw ellipsoids whose semi-axes vary independently."""
     ball = icosphere(splits)
     axes = AXES + spread * np.random.default_rng(seed).standard_normal((count, 3))
     return Ellipsoids(ball.verts * axes[:, None], ball.faces, axes)
 
 
 def moved(points: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Each shape turned and moved at random, but the first."""
+    """Move each shape (S, V, 3) but the first by a random rotation, and all by random translations."""
     random = np.random.default_rng(seed)
     turns = Rotation.random(len(points), rng=random).as_matrix()
     turns[0] = np.eye(3)

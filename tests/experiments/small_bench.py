@@ -1,4 +1,4 @@
-"""A benchmark of little bumpy spheres in the layout of the real one, and a matcher that knows the answer."""
+"""A benchmark of small bumpy spheres in the layout of the real one, and a method that knows the true maps."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +17,12 @@ FAUST_NAMES = ("tr_reg_000", "tr_reg_001", "tr_reg_010")
 
 
 def order(name: str) -> np.ndarray:
-    """Which vertex of `BODY` each vertex of a shape is: another shuffle for every name."""
+    """Return the vertex of `BODY` that each vertex of a shape is: a permutation seeded by the name."""
     return np.random.default_rng([ord(c) for c in name]).permutation(BODY.V)
 
 
 def build(folder: Path) -> Path:
-    """Write the three sets. Vertex k of `BODY` is landmark k; SCAPE shapes keep its order, the others shuffle
-    it.
-    """
+    """Write the three sets; vertex k of `BODY` is landmark k. SCAPE shapes keep its order, the others are permuted."""
     for number, name in enumerate(("1", "2", "10")):
         _save(folder / "shrec19", name, order(name), 1.0 + number)
     (folder / "shrec19" / "pairs.txt").write_text("1 2\n1 10\n10 2\n\n")
@@ -37,14 +35,14 @@ def build(folder: Path) -> Path:
 
 def _save(folder: Path, name: str, vertices: np.ndarray, scale: float) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    landmarks = np.argsort(vertices)  # where vertex k of the body went
+    landmarks = np.argsort(vertices)  # vertex of the shape for vertex k of the body
     save_shape(folder / f"{name}.ply", Shape(scale * BODY.verts[vertices], landmarks[BODY.faces], name))
     if folder.name != "scape":
         np.save(folder / f"{name}.landmarks.npy", landmarks.astype(np.int32))
 
 
 def truth(source: str, target: str) -> np.ndarray:
-    """The right map ``(V,)`` between two shapes of a set."""
+    """Return the true map ``(V,)`` between two shapes of a set."""
     if source.startswith("mesh"):
         return np.arange(BODY.V)
     return np.argsort(order(target))[order(source)]
@@ -52,8 +50,9 @@ def truth(source: str, target: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Oracle:
-    """Knows every map, or refuses the shapes it was told to refuse; its fit of a shape is the shape's
-    name.
+    """Method that knows every map; its fit of a shape is the shape's name.
+
+    It raises `InputError` for the shape ``refuses``, and reverses maps if ``turned``.
     """
 
     refuses: str = ""

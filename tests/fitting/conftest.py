@@ -1,4 +1,4 @@
-"""The model of eggs, and its least squares."""
+"""The model of eggs, and its node system."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A model of eggs that nobody trained: small, quick, and with everything that fitting asks of a model."""
+"""An untrained model of eggs: small, fast, and complete enough for fitting."""
 
 from dataclasses import replace
 from functools import cache
@@ -36,7 +36,7 @@ def egg_model(kernel: Kernel = "smooth", network: NetworkConfig = NETWORK) -> Tr
 
 
 def write_model(model: TrainedModel, folder: Path) -> Path:
-    """The same as a model folder."""
+    """Write a model as a model folder."""
     folder.mkdir(parents=True)
     save_template(model.template, folder / "template.safetensors")
     digest = save_weights(model.network.state_dict(), folder / "weights.safetensors", storage="float32")
@@ -45,18 +45,18 @@ def write_model(model: TrainedModel, folder: Path) -> Path:
 
 
 def bent_egg(model: TrainedModel, seed: int = 0) -> Shape:
-    """A shape of the category, with the template's triangles."""
+    """Draw a shape of the category, with the template's triangles."""
     drawn = bent_eggs(model.template)(1, torch.Generator().manual_seed(seed))[0].double().numpy()
     return Shape(drawn, model.template.shape.faces, f"egg {seed}")
 
 
 def scan_of(shape: Shape, P: int = 800, seed: int = 0) -> OrientedPoints:
-    """Samples of a shape where it is."""
+    """Sample a shape, in its own coordinates."""
     samples = sample_surface(shape, P, np.random.default_rng(seed))
     return OrientedPoints(samples.points, samples.normals)
 
 
 def gentle_vectors(model: TrainedModel, size: float = 0.04) -> np.ndarray:
-    """Node vectors (K, 3) of a smooth deformation: a quadratic bend."""
+    """Return node vectors (K, 3) of a smooth deformation."""
     x, y, z = model.template.nodes.T
     return size * np.stack([np.sin(4 * y), 2 * x * y, np.cos(4 * y) * z * 4], 1)

@@ -1,4 +1,4 @@
-"""What holds for every rig of an animal."""
+"""Properties of every animal rig."""
 
 import numpy as np
 

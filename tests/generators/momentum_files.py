@@ -1,4 +1,4 @@
-"""A Momentum rig laid by hand, written as its release has it: a small tetrahedron around every joint that is read."""
+"""A hand-made Momentum rig in the files of its release, with a small tetrahedron around every joint that is read."""
 
 import struct
 import zlib
@@ -14,7 +14,7 @@ _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 
 
 def _layout() -> list[tuple[str, str, np.ndarray]]:
-    """Joints of the rig: name, parent, place in cm; of bones those that twist at equal distances."""
+    """Return name, parent and position in cm of the joints, with equidistant twist joints along bones."""
     rig = stick_figure(3)
     at = {name: 100 * rig.heads[1, k].double().numpy() for k, name in enumerate(rig.names)}
     rows = [("body_world", "", np.zeros(3)), ("root", "body_world", at["root"])]
@@ -44,7 +44,7 @@ def _layout() -> list[tuple[str, str, np.ndarray]]:
 
 
 def write_rig(folder: Path, shapes: int = 47) -> list[str]:
-    """Write both files; the names of the joints, each with four vertices."""
+    """Write both files; return the names of the joints, each of which has four vertices."""
     rows = _layout()
     names = [name for name, *_ in rows]
     place = np.array([at for *_, at in rows])
@@ -93,7 +93,7 @@ def node(name: str, values: list[Any], children: list[Any] | None = None) -> tup
 
 
 def fbx(nodes: list[Any]) -> bytes:
-    """A binary FBX file of version 7.4."""
+    """Encode nodes as a binary FBX file of version 7.4."""
     data = bytearray(b"Kaydara FBX Binary  \0\x1a\0" + struct.pack("<I", 7400))
     for each in nodes:
         _append(data, each)

@@ -1,4 +1,4 @@
-"""A stick figure: a rig laid by hand, with the joints that poses speak of and a few vertices around each bone."""
+"""A stick figure: a hand-made rig with the joints that poses use and a few vertices around each joint."""
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ _SIDE = [
 
 
 def stick_figure(identities: int = 2) -> Rig:
-    """Bodies of several sizes: 4 vertices (a small tetrahedron) around every joint, moved by that joint alone."""
+    """Build a rig of several sizes; each joint moves 4 vertices around it (a small tetrahedron), and no others."""
     names, parents, heads = [], [], []
     for name, parent, at in _TRUNK:
         names.append(name)

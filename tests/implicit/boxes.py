@@ -1,4 +1,4 @@
-"""Boxes whose signed distance is known, and a training that takes a second."""
+"""Boxes with known signed distance, and settings for training within a second."""
 
 from dataclasses import replace
 from itertools import product
@@ -20,7 +20,7 @@ def config(field: str) -> ImplicitConfig:
 
 
 def box(half: np.ndarray, name: str = "box") -> Shape:
-    """A closed box around the origin, its faces outwards."""
+    """Build a closed box, centered at the origin, with outward faces."""
     verts = np.array(list(product((-1.0, 1.0), repeat=3))) * half
     faces = ConvexHull(verts).simplices.astype(np.int64)
     corners = verts[faces]
@@ -35,7 +35,7 @@ def box_sdf(points: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def boxes(folder: Path, count: int = 4) -> list[np.ndarray]:
-    """Write boxes of different sides, and say their half sides."""
+    """Write boxes of different sizes; return their half sides."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
     halves = [rng.uniform([0.5, 0.2, 0.3], [1.0, 0.6, 0.8]) for _ in range(count)]

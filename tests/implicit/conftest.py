@@ -1,4 +1,4 @@
-"""A folder of boxes, and a model of them that has a surface."""
+"""A folder of boxes, and a model trained on them far enough to have a surface."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A model folder with a few numbers in it: a network that loads, and learned nothing."""
+"""A small model folder: its network can be loaded, but is not trained."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ NETWORK = NetworkConfig(code=4, width=4, depth=1, basis=4, align_basis=0, correc
 
 
 def small_card(**changes: Any) -> ModelCard:
-    """A card that is right in every entry."""
+    """A model card with valid entries; `changes` replace fields."""
     card = ModelCard(
         name="blob",
         category="blobs",
@@ -41,7 +41,7 @@ def small_card(**changes: Any) -> ModelCard:
 
 
 def small_template() -> Template:
-    """An octahedron with a node at every corner."""
+    """An octahedron with a node at every vertex."""
     verts = np.concatenate([np.eye(3), -np.eye(3)]) * 0.4
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
     ball = Shape(verts, faces, "ball")

@@ -1,4 +1,4 @@
-"""A page in headless Chromium: opened, watched for complaints and for the network, and pictured."""
+"""Open pages in headless Chromium, record console messages and requests, and take screenshots."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "h
 
 
 def chromium() -> str:
-    """The program, or the test is skipped. MESHMATCH_CHROMIUM names one that is not on the path."""
+    """Return the path of Chromium, on the path or in MESHMATCH_CHROMIUM; skip the test without it."""
     found = os.environ.get("MESHMATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if found is None:
         pytest.skip("no Chromium here: apt-get install chromium, or set MESHMATCH_CHROMIUM")
@@ -32,7 +32,7 @@ def chromium() -> str:
 
 @dataclass(eq=False)
 class Opened:
-    """A page that is open, with what it said and asked for."""
+    """An open page, with its console messages and errors (``said``) and requested URLs (``asked``)."""
 
     page: Any
     said: list[str] = field(default_factory=list)
@@ -42,11 +42,11 @@ class Opened:
         return dict(self.page.evaluate("meshmatch.state()"))
 
     def place(self, side: str, vertex: int) -> dict[str, Any]:
-        """x, y on the screen, and whether it is seen."""
+        """Return x, y of a vertex on the screen, and whether it is visible."""
         return dict(self.page.evaluate("([s, v]) => meshmatch.project(s, v)", [side, vertex]))
 
     def settled(self) -> dict[str, Any]:
-        """The state when two more frames could have been drawn."""
+        """Return the state after two more frames."""
         self.page.evaluate("new Promise(r => requestAnimationFrame(() => requestAnimationFrame(() => r())))")
         return self.state()
 
@@ -58,7 +58,7 @@ class Opened:
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """Chromium, with nothing of anybody's in it."""
+    """Launch Chromium with a new profile."""
     program = chromium()
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser (extra dev)")
     with playwright.sync_playwright() as driver:
@@ -69,7 +69,7 @@ def browser() -> Iterator[Any]:
 
 @contextmanager
 def opened(running: Any, path: Path, **options: Any) -> Iterator[Opened]:
-    """Open a file, wait until it is drawn; afterwards it must have kept quiet and asked for nothing else."""
+    """Open a file and wait until it is drawn; at exit, assert no console messages and no other requests."""
     context = running.new_context(**(DESKTOP | options))
     page = context.new_page()
     seen = Opened(page)
@@ -85,7 +85,7 @@ def opened(running: Any, path: Path, **options: Any) -> Iterator[Opened]:
 
 
 def nameless(view: Opened) -> list[str]:
-    """What can be used on a page but has no name that a screen reader could say."""
+    """Return the controls of a page without an accessible name for screen readers."""
     said = "e => e.ariaLabel || e.innerText || [...(e.labels ?? [])].map(l => l.innerText).join() || ''"
     used = view.page.locator("button, input, select, summary, [role=application]").all()
     return [element.evaluate("e => e.outerHTML") for element in used if not element.evaluate(said).strip()]

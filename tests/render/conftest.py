@@ -1,4 +1,4 @@
-"""A browser for the pages of a module, and a folder for screenshots that people may want to see."""
+"""A browser for the tests of a module, and a folder for screenshots to look at."""
 
 import os
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ def running() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that MESHMATCH_ARTEFACTS names, else a temporary one."""
+    """The folder named by MESHMATCH_ARTEFACTS, else a temporary one."""
     named = os.environ.get("MESHMATCH_ARTEFACTS")
     folder = Path(named) if named else tmp_path_factory.mktemp("artefacts")
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""A page as a file: its elements, and the words and arrays that its scripts find in it."""
+"""Parse the file of a page: its elements, and the words and arrays embedded for its scripts."""
 
 import base64
 import json
@@ -60,7 +60,7 @@ def read(path: Path) -> Page:
 
 
 def unpacked(table: list[dict[str, Any]], text: str) -> dict[str, np.ndarray]:
-    """The arrays of a table, each at a multiple of 4 bytes."""
+    """Decode the arrays of a table; each must start at a multiple of 4 bytes."""
     data = zlib.decompress(base64.b64decode(text, validate=True))
     assert all(row["start"] % 4 == 0 for row in table)
     return {row["name"]: np.frombuffer(data, DTYPES[row["kind"]], row["length"], row["start"]) for row in table}

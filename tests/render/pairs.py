@@ -1,4 +1,4 @@
-"""Two shapes with a map between them that is known."""
+"""Pairs of shapes with known maps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from meshmatch.shapes.shape import Shape
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """There and back between two shapes, vertex by vertex."""
+    """Two shapes and the vertex maps in both directions."""
 
     source: Shape
     target: Shape
@@ -22,7 +22,7 @@ class Pair:
 
 
 def itself(shape: Shape) -> Pair:
-    """A shape and the same one."""
+    """Pair a shape with itself."""
     same = VertexMap.identity(shape)
     return Pair(shape, shape, same, same)
 
@@ -30,10 +30,11 @@ def itself(shape: Shape) -> Pair:
 def stirred(
     shape: Shape, name: str = "stirred", verdict: str = "good", reasons: tuple[str, ...] = (), lean: float = 0.0
 ) -> Pair:
-    """A shape, and the same one larger, elsewhere, z instead of y up, its vertices in another order; leaning to
-    one side by so much of its height.
+    """Pair a shape with a copy that is scaled, translated, z up instead of y up, and has permuted vertices.
+
+    ``lean`` shears the copy to one side, as a fraction of its height.
     """
-    order = np.random.default_rng(5).permutation(shape.V)  # new row k is the old row order[k]
+    order = np.random.default_rng(5).permutation(shape.V)  # vertex k of the copy is vertex order[k] of the shape
     place: NDArray[np.int64] = np.argsort(order)
     leaning = shape.verts + lean * shape.verts[:, [1]] * np.array([1.0, 0.0, 0.0])
     verts = 3.0 * leaning[order][:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0]) + 7.0
@@ -46,6 +47,6 @@ def stirred(
 
 
 def bump(sphere: Shape) -> Shape:
-    """A sphere that has no symmetry: a nose at +z, longer than wide."""
+    """Deform a sphere into an asymmetric shape: stretched, with a bump near +z."""
     nose = np.exp(-8 * ((sphere.verts - [0.2, 0.3, 0.9]) ** 2).sum(axis=1))
     return Shape(sphere.verts * np.array([0.8, 1.5, 0.6]) * (1 + 0.5 * nose)[:, None], sphere.faces, "egg.ply")

@@ -1,4 +1,4 @@
-"""Where a line is in the picture of a chart."""
+"""Find the pixels of a line in the picture of a chart."""
 
 from pathlib import Path
 
@@ -9,8 +9,9 @@ from meshmatch.render.charts import COLORS
 
 
 def spots(path: Path, number: int, left: float = 0.0, top: float = 0.15, right: float = 0.78) -> np.ndarray:
-    """(N, 2) x to the right and y upwards of the pixels in a line's color, within these shares of the picture (where
-    no legend is).
+    """Return x (to the right) and y (upward), (N, 2), of the pixels in a line's color.
+
+    ``left``, ``top`` and ``right``, as fractions of the picture, exclude the legend.
     """
     with Image.open(path) as image:
         pixels = np.asarray(image.convert("RGB"), int)

@@ -1,4 +1,4 @@
-"""Characters in VRM 0.x and 1.0, made by hand, and what all numbers in their extensions stand for."""
+"""Hand-made characters in VRM 0.x and 1.0, and their extensions with names in place of indices."""
 
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ IMAGES = ("color", "shade", "rim", "thumbnail")
 
 
 def picture(k: int) -> bytes:
-    """The k-th image of a character."""
+    """Encode the k-th image of a character."""
     return encoded(np.roll(quarters(4), k, axis=0) // (k + 1))
 
 
 def write_character(path: Path, version: int, **more: Any) -> None:
-    """A square that two joints move, with three morph targets and a toon material, and two eyes that share a mesh.
+    """Write a square moved by two joints, with three morph targets and a toon material, and two eyes that share a mesh.
 
-    `more` goes into the toon material's extension, or into its properties.
+    `more` is added to the toon material's extension (1.0) or properties (0.x).
     """
     arrays = [
         CORNERS.astype("f4"),
@@ -146,7 +146,7 @@ def read(path: Path) -> Document:
 
 
 def image_of(document: Document, texture: int) -> str:
-    """The name of a texture's image; of an image that was there before only if its data are still the same."""
+    """Return the name of a texture's image; the data of an image that `write_character` wrote must be unchanged."""
     return named_image(document, document.json["textures"][texture]["source"])
 
 
@@ -159,7 +159,7 @@ def named_image(document: Document, number: int) -> str:
 
 
 def toon_images(document: Document, number: int = 0) -> dict[str, str]:
-    """Names of all images of a toon material, in either version, by the words of 0.x."""
+    """Return the names of a toon material's images, in either version, by the property names of 0.x."""
     old = document.json["extensions"].get("VRM")
     if old is not None:
         return {key: image_of(document, k) for key, k in old["materialProperties"][number]["textureProperties"].items()}
@@ -174,7 +174,7 @@ def toon_images(document: Document, number: int = 0) -> dict[str, str]:
 
 
 def said(path: Path) -> dict[str, Any]:
-    """All that the extensions say, but for toon materials, with names in place of numbers."""
+    """Return the contents of the extensions, but for toon materials, with names in place of indices."""
     document = read(path)
     json = document.json
     nodes = [node.get("name") for node in json["nodes"]]

@@ -1,4 +1,4 @@
-"""What several tests of files read."""
+"""Fixtures for tests of file formats."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tests.shapes.morphs import write_morphs
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A gltf with morph targets and a clip; see `write_morphs`."""
+    """A glTF file with morph targets and a clip; see `write_morphs`."""
     path = tmp_path / "face.gltf"
     write_morphs(path)
     return path

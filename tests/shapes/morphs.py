@@ -1,4 +1,4 @@
-"""A glTF scene with morph targets, made by hand: two meshes below a node that is turned and enlarged."""
+"""A hand-made glTF scene with morph targets: two meshes below a rotated and scaled node."""
 
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ ONE = np.array([[0.5, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]], "f4")
 
 
 def write_morphs(path: Path, **more: Any) -> None:
-    """Squares "face" (shapes smile, blink) and "teeth" (shapes blink, open), and a clip of both.
+    """Write squares "face" (morph targets smile, blink) and "teeth" (blink, open), and a clip of both.
 
-    `more` goes into the document.
-    smile lifts face by 1 along its own z, blink moves the first corner of either mesh, and open lifts the teeth.
+    smile lifts the face by 1 along its own z, blink moves the first corner of either mesh, and open lifts the teeth. `more`
+    is added to the document.
     """
     times = np.array([0, 1, 3], "f4")
     talk = np.array([0, 0, 1, 0.5, 0, 1], "f4")  # smile and blink of face

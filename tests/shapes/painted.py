@@ -1,4 +1,4 @@
-"""Files with textures, made by hand: a square of two triangles, and pictures of a few pixels."""
+"""Hand-made files with textures: a square of two triangles, and images of a few pixels."""
 
 import base64
 import json
@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-# Counter-clockwise from the origin; the texture coordinates of glTF, v down: (x, 1 - y).
+# Counter-clockwise from the origin. Texture coordinates as in glTF, v down: (x, 1 - y).
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], float)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def quarters(size: int = 2) -> np.ndarray:
-    """A picture of four flat quarters: red, green over blue, white."""
+    """An image of four uniform quarters: red and green above blue and white."""
     four = np.array([[[255, 0, 0, 255], [0, 255, 0, 255]], [[0, 0, 255, 255], [255, 255, 255, 255]]], np.uint8)
     return four.repeat(size // 2, axis=0).repeat(size // 2, axis=1)
 
@@ -28,7 +28,7 @@ def encoded(pixels: np.ndarray, kind: str = "PNG") -> bytes:
 
 
 def write_square_obj(path: Path, mtl: str | None = "square.mtl", vt: bool = True) -> None:
-    """The square as an obj; vt has v up, so it equals x, y."""
+    """Write the square as an obj; vt has v up, so it equals x, y."""
     lines = [] if mtl is None else [f"mtllib {mtl}"]
     lines += [f"v {x} {y} {z}" for x, y, z in CORNERS]
     lines += [f"vt {x} {y}" for x, y, _ in CORNERS]
@@ -40,7 +40,10 @@ def write_square_obj(path: Path, mtl: str | None = "square.mtl", vt: bool = True
 def write_document(
     path: Path, document: dict[str, Any], *arrays: np.ndarray, file: str = "", normalized: int = -1
 ) -> None:
-    """A glb or gltf: array k is accessor k and view k of one buffer, which a gltf has within it, or in a file beside it."""
+    """Write a glb or gltf; array k is accessor k and view k of one buffer.
+
+    The buffer of a gltf is embedded, or in the separate ``file`` in the same folder.
+    """
     kinds = {"float32": 5126, "int16": 5122, "uint8": 5121, "uint16": 5123, "uint32": 5125}
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -51,7 +54,7 @@ def write_document(
         accessors.append({"bufferView": k, "componentType": kinds[array.dtype.name], "count": len(array), "type": kind})
         if (
             kind in ("SCALAR", "VEC3") and array.dtype.kind == "f" and np.isfinite(array).all()
-        ):  # times and positions need it
+        ):  # required for times and positions
             rows = array.reshape(len(array), -1)
             accessors[k] |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
@@ -71,7 +74,7 @@ def write_document(
 
 
 def glb(document: dict[str, Any], body: bytes) -> bytes:
-    """The glb of a document and its buffer, as a stranger's program may have made it, warnings and all."""
+    """Encode a document and its buffer as a glb as it is, even if validators would warn."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = b"glTF" + np.array([2, 28 + len(text) + len(body), len(text)], "<u4").tobytes() + b"JSON"
@@ -79,7 +82,7 @@ def glb(document: dict[str, Any], body: bytes) -> bytes:
 
 
 def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The document and the buffer of a glb."""
+    """Split a glb into its document and its buffer."""
     end = 20 + int.from_bytes(data[12:16], "little")
     return json.loads(data[20:end]), data[end + 8 :]
 
@@ -92,10 +95,10 @@ def write_gltf(
     embed: bool = True,
     **rest: Any,
 ) -> None:
-    """Squares as a glb or gltf, one node each, the k-th moved k to the right.
+    """Write squares as a glb or gltf, one node each, the k-th moved k to the right.
 
-    A primitive may have `material`, `uv` (4, 2) or None, `uv1`, `colors` (4, n). Images are bytes, kept in the
-    buffer (`embed`) or as data URIs, or URIs themselves. `rest` goes into the document as it is.
+    A primitive may have `material`, `uv` (4, 2) or None, `uv1`, `colors` (4, n). Images are bytes, stored in the buffer
+    (`embed`) or as data URIs, or they are URIs. `rest` is added to the document.
     """
     arrays: list[np.ndarray] = []
 

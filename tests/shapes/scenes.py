@@ -1,4 +1,4 @@
-"""Bodies of the samples with other things in the same file: floors, boxes, chairs, coats, eyes, a second body."""
+"""Sample bodies with other objects in the same file: floors, boxes, chairs, coats, eyes, a second body."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def sample(name: str) -> Shape:
 
 
 def together(name: str, *shapes: Shape) -> Shape:
-    """Shapes in one file, one after the other."""
+    """Concatenate shapes into one."""
     before = np.cumsum([0, *(shape.V for shape in shapes)])
     faces = [shape.faces + offset for shape, offset in zip(shapes, before[:-1], strict=True)]
     return Shape(np.concatenate([shape.verts for shape in shapes]), np.concatenate(faces), name)
@@ -31,7 +31,7 @@ def box(low: list[float], high: list[float], name: str = "box") -> Shape:
 
 
 def sheet(center: np.ndarray, width: float) -> Shape:
-    """A square floor of one layer."""
+    """A square, single-sided floor."""
     side = np.linspace(-width / 2, width / 2, 13)
     x, y = np.meshgrid(side, side, indexing="ij")
     verts = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3) + center
@@ -41,7 +41,7 @@ def sheet(center: np.ndarray, width: float) -> Shape:
 
 
 def below(body: Shape) -> np.ndarray:
-    """A little under the feet."""
+    """Return a point slightly below the feet."""
     low, high = body.bounds
     return np.array([*(low + high)[:2] / 2, low[2] - 0.003])
 
@@ -51,7 +51,7 @@ def floor(body: Shape, width: float = 3.0) -> Shape:
 
 
 def fused_with_floor(body: Shape, width: float = 3.0) -> Shape:
-    """A body and a floor that triangles between a foot and the floor make one part."""
+    """Join a body and a floor into one part by triangles between a foot and the floor."""
     ground = floor(body, width)
     lowest, middle = int(np.asarray(body.verts)[:, 2].argmin()), body.V + np.array([84, 85, 97])
     bridge = np.array([[lowest, middle[0], middle[1]], [lowest, middle[2], middle[0]]])
@@ -68,13 +68,13 @@ def pedestal(body: Shape, height: float = 0.5) -> Shape:
 
 
 def pack(body: Shape) -> Shape:
-    """A box on the back."""
+    """A box on the back of a body."""
     x, y, z = body.bounds.mean(axis=0)
     return box([x - 0.2, y + 0.05, z - 0.05], [x + 0.2, y + 0.4, z + 0.45])
 
 
 def chair(place: np.ndarray) -> Shape:
-    """A seat, a back and four legs, each a part of its own."""
+    """A chair: seat, back and four legs as separate parts."""
     x, y, z = place
     legs = [
         box([x + i - 0.02, y + j - 0.02, z], [x + i + 0.02, y + j + 0.02, z + 0.42])
@@ -86,30 +86,30 @@ def chair(place: np.ndarray) -> Shape:
 
 
 def beside(body: Shape, away: float = 0.35) -> np.ndarray:
-    """A place on the floor on one side of a body."""
+    """Return a point on the floor at one side of a body."""
     return np.array([body.bounds[1, 0] + away, *below(body)[1:]])
 
 
 def coat(body: Shape) -> Shape:
-    """The trunk, pushed out by 2 % of the height: open, and a part of its own."""
+    """A copy of the trunk, offset by 2 % of the height: an open, separate part."""
     height = (body.verts[:, 2] - body.bounds[0, 2]) / np.ptp(body.bounds[:, 2])
     faces = body.faces[((height > 0.3) & (height < 0.75))[body.faces].all(axis=1)]
     used, corners = np.unique(faces, return_inverse=True)
     out = 0.02 * np.ptp(body.bounds[:, 2]) * body.vertex_normals[used]
     pieces = trimesh.Trimesh(body.verts[used] + out, corners.reshape(-1, 3), process=False).split(only_watertight=False)
-    largest = max(pieces, key=lambda piece: piece.area)  # without what it covers of a hand
+    largest = max(pieces, key=lambda piece: piece.area)  # without pieces that cover a hand
     return Shape(largest.vertices, largest.faces, "coat")
 
 
 def eyes(body: Shape) -> Shape:
-    """Two small balls near the top of the head."""
+    """Two small balls in the head."""
     top = body.verts[body.verts[:, 2].argmax()]
     ball = trimesh.creation.icosphere(2, 0.015)
     return together("eyes", *(Shape(ball.vertices + top + [x, 0, -0.06], ball.faces) for x in (-0.03, 0.03)))
 
 
 def second(body: Shape, away: float = 0.9) -> Shape:
-    """The same body beside it, facing the other way."""
+    """The same body next to it, facing the other way."""
     middle = body.bounds.mean(axis=0) * [1, 1, 0]
     return Shape((body.verts - middle) * [-1, -1, 1] + middle + [away, 0, 0], body.faces, "second")
 

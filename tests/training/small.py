@@ -1,4 +1,4 @@
-"""A tiny template, a source of bent eggs, and a network that learns from them in seconds."""
+"""A tiny template, a source of bent eggs, and a network that trains on them in seconds."""
 
 from functools import cache
 from pathlib import Path
@@ -24,7 +24,7 @@ from tests.conftest import icosphere
 NETWORK = NetworkConfig(
     code=16, width=32, depth=1, basis=24, align_basis=16, align_width=16, corrections=2, correct_width=16
 )
-# The paper's choices, but narrow.
+# The paper's architecture, but narrow.
 POINTS = NetworkConfig(encoder="point", decoder="node", code=16, width=32, align_basis=0, corrections=0)
 SCAN = ScanConfig(points=96, noise=0.012, outliers=0, partial=0)
 UPRIGHT = ScanConfig(points=96, noise=0, holes=0, outliers=0, partial=0, density=0, bumps=0, scale=0, upright=True)
@@ -32,7 +32,7 @@ UPRIGHT = ScanConfig(points=96, noise=0, holes=0, outliers=0, partial=0, density
 
 @cache
 def egg_template() -> Template:
-    """An egg with three different axes, 162 vertices, 36 nodes."""
+    """The template: an egg with three different axes, 162 vertices and 36 nodes."""
     ball = icosphere(2)
     egg = Shape(ball.verts * [0.8, 1.5, 1.0], ball.faces, "egg")
     config = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
@@ -40,7 +40,7 @@ def egg_template() -> Template:
 
 
 def bent_eggs(template: Template) -> Source:
-    """The template under a random affine map and a bend."""
+    """Return a source of shapes: the template under random affine maps and bends."""
     rest = torch.from_numpy(np.array(template.shape.verts)).float()
 
     def draw(count: int, generator: torch.Generator) -> torch.Tensor:
@@ -48,7 +48,7 @@ def bent_eggs(template: Template) -> Source:
         bend = 0.8 * torch.randn(count, 1, generator=generator)
         verts = (rest @ affine.transpose(1, 2)).clone()
         verts[..., 0] += bend * verts[..., 1] ** 2
-        return 3.0 * verts  # any unit
+        return 3.0 * verts  # the unit is arbitrary
 
     return draw
 
@@ -70,7 +70,7 @@ def small_points(template: Template, kernel: Kernel = "smooth", model: Deformer 
 
 
 def registered_eggs(folder: Path, count: int) -> Path:
-    """So many registered eggs as files."""
+    """Write ``count`` registered eggs to a folder."""
     rng, egg = np.random.default_rng(0), egg_template().shape
     folder.mkdir()
     for n in range(count):
@@ -79,7 +79,7 @@ def registered_eggs(folder: Path, count: int) -> Path:
 
 
 def prepared_eggs(root: Path, count: int) -> Path:
-    """The same in the folder "in", prepared in the folder "out"."""
+    """Write registered eggs to the folder "in" and prepare them in the folder "out", which is returned."""
     nodes = NodeConfig(strategy="uniform", K=36, radius=0.45, depth=0.05)
     prepare(registered_eggs(root / "in", count), root / "out", PrepareConfig(nodes))
     return root / "out"

@@ -1,4 +1,4 @@
-"""Shapes that lie on one another by construction, and a slow search that cannot be wrong."""
+"""Two meshes of the same surface with exact maps, and a brute-force closest point search."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from meshmatch.shapes.shape import Shape
 
 
 def split(shape: Shape, name: str = "split") -> tuple[Shape, VertexMap, VertexMap]:
-    """The same surface with four triangles for each; the maps shape -> split and split -> shape, exact."""
+    """Split each triangle into four; return the result and the exact maps shape -> split and split -> shape."""
     f = shape.faces
     ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
     edges, first, inverse = np.unique(ends, axis=0, return_index=True, return_inverse=True)
@@ -32,7 +32,7 @@ def split(shape: Shape, name: str = "split") -> tuple[Shape, VertexMap, VertexMa
 
 
 def brute_force(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The closest point on a mesh of each point, by asking every triangle: distances (N,), points (N, 3)."""
+    """Find the closest point on a mesh of each point over all triangles: distances (N,), points (N, 3)."""
     best, feet = np.empty(len(points)), np.empty_like(points)
     for n, point in enumerate(points):
         weights = closest_on_triangles(np.tile(point, (len(faces), 1)), *verts[faces].swapaxes(0, 1))

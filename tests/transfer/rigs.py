@@ -1,4 +1,4 @@
-"""A rigged tube, made by hand, and how a rigged file stands at a moment of a clip."""
+"""A hand-made rigged tube, and the pose of a rigged file at a time of a clip."""
 
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,13 @@ from tests.shapes.painted import write_document
 
 RINGS, AROUND = 41, 16
 BEND = 60.0
-"""Degrees that the clip turns the knee by."""
+"""Rotation of the knee at the end of the clip, in degrees."""
 KNEE, FOOT = np.array([0, 1.0, 0]), np.array([0, 1.9, 0])
 NODES = ("armature", "root", "hip", "knee", "tip", "foot", "tube")
 
 
 def tube() -> Shape:
-    """A closed tube of height 2, an oval across, which stands on the origin."""
+    """A closed tube of height 2 with an oval cross-section, standing at the origin."""
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     oval = np.stack([0.25 * np.sin(angle), np.zeros(AROUND), 0.15 * np.cos(angle)], axis=1)
     heights = np.linspace(0, 2, RINGS)
@@ -37,18 +37,18 @@ def tube() -> Shape:
 
 
 def weights_of(height: np.ndarray) -> np.ndarray:
-    """(V, 3) of hip, knee and foot."""
+    """Return the weights (V, 3) of hip, knee and foot."""
     knee = np.clip((height - 0.8) / 0.4, 0, 1)
     foot = np.clip((height - 1.7) / 0.2, 0, 1)
     return np.stack([1 - knee, knee * (1 - foot), knee * foot], axis=1)
 
 
 def write_tube(path: Path, *, stands: float = 0.0, clips: bool = True, **more: Any) -> Shape:
-    """A tube with a skeleton below an armature that is turned and a hundred times as large; its clip "bend" bends the knee
-    within a second.
+    """Write a tube with a skeleton below an armature that is rotated and scaled by 100.
 
-    The joints are root, which moves nothing, hip, knee and foot, which hangs from the root and follows the knee. The file
-    stands as the clip does when the knee is turned by `stands` degrees. `more` goes into the document.
+    Its clip "bend" bends the knee within a second. The joints are root, which moves no vertex, hip, knee and foot; the foot
+    is a child of the root and follows the knee. The pose of the file has the knee bent by `stands` degrees. `more` is added
+    to the document.
     """
     shape = tube()
     weights = weights_of(shape.verts[:, 1])
@@ -60,7 +60,7 @@ def write_tube(path: Path, *, stands: float = 0.0, clips: bool = True, **more: A
         world[:3, :3], world[:3, 3] = 100 * turn, place
         inverse[joint] = np.linalg.inv(world)
     times = np.linspace(0, 1, 13).astype("f4")
-    own = turn.T / 100  # from the scene into the armature
+    own = turn.T / 100  # from the scene to the armature
     knees = Rotation.from_rotvec(np.radians(BEND) * times[:, None] * [1.0, 0, 0])
     bent = KNEE + knees.apply(FOOT - KNEE)
     into = Rotation.from_matrix(turn.T)
@@ -105,7 +105,7 @@ def write_tube(path: Path, *, stands: float = 0.0, clips: bool = True, **more: A
 
 
 def played(path: Path, clip: str = "", time: float = 0.0) -> np.ndarray:
-    """The vertices of a file at a moment of a clip, by linear blend skinning; without a clip as the file stands."""
+    """Return the vertices at a time of a clip, or in the file's pose without one, by linear blend skinning."""
     document = Document(path, path.read_bytes())
     for animation in document.json.get("animations", []):
         for channel in animation["channels"] if animation["name"] == clip else []:

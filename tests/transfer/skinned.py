@@ -1,4 +1,4 @@
-"""A small glb with a skin, written by hand."""
+"""A small hand-made glb with a skin."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ from tests.shapes.painted import write_document
 
 
 def write_skinned_glb(path: Path, wide: bool = False) -> None:
-    """A sword of one triangle on the knee, a body of two triangles on knee and hip, a stone on nothing.
+    """Write a sword of one triangle on the knee, a body of two triangles on knee and hip, and a separate stone.
 
-    Vertices as the scene lists them: 0 to 2 the sword; 3 and 4 on the knee, 5 on both halves, 6 on the hip;
-    7 to 9 the stone. With ``wide`` vertex 3 has eight places for joints, and the hip in the fifth of them.
+    Vertices in the order of the scene: 0 to 2 are the sword; 3 and 4 follow the knee, 5 both joints equally, 6 the hip; 7 to
+    9 are the stone. With ``wide`` vertices of the body have eight slots for joints, and vertex 3 has the hip in the fifth.
     """
     body = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4")
     joints = np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0], [1, 0, 0, 0]], "<u2")
@@ -19,7 +19,7 @@ def write_skinned_glb(path: Path, wide: bool = False) -> None:
     if wide:
         weights[0, 0] = 0.75
     more_joints, more = np.zeros((4, 4), "u1"), np.zeros((4, 4), "u1")
-    more_joints[0, 0], more[0, 0] = 1, 64  # normalised: 64 / 255
+    more_joints[0, 0], more[0, 0] = 1, 64  # normalized: 64 / 255
     arrays = [
         body,
         np.array([0, 1, 2, 1, 3, 2], "<u2"),
@@ -47,6 +47,6 @@ def write_skinned_glb(path: Path, wide: bool = False) -> None:
             {"primitives": [{"attributes": attributes, "indices": 1}]},
             {"primitives": [{"attributes": {"POSITION": 4}}]},
         ],
-        "skins": [{"joints": [1, 0]}],  # the skin counts its joints in its own order: 0 is the knee
+        "skins": [{"joints": [1, 0]}],  # indices of joints are in the skin's order: 0 is the knee
     }
     write_document(path, document, *arrays, normalized=6)

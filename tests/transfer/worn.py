@@ -1,4 +1,4 @@
-"""A rod, a sleeve around it, and both bent: small shapes of which the truth is known."""
+"""A rod, a sleeve around it, and a bend of both: small shapes with known results."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ RADIUS, LENGTH = 0.2, 2.0
 
 
 def tube(radius: float, length: float, around: int, along: int, name: str, closed: bool = False) -> Shape:
-    """A pipe along y around the origin; closed by a point at each end."""
+    """A pipe along y, centered at the origin; ``closed`` adds a fan of triangles at each end."""
     height, angle = np.meshgrid(np.linspace(-0.5, 0.5, along) * length, np.arange(around) * 2 * np.pi / around)
     height, angle = height.T.ravel(), angle.T.ravel()
     verts = np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], axis=1)
@@ -31,7 +31,7 @@ def tube(radius: float, length: float, around: int, along: int, name: str, close
 
 
 def bent(points: Floats, turn: float = 1.2) -> Floats:
-    """Points of a rod that is bent to an arc: each of its disks moves as a whole."""
+    """Bend points of a rod along y to an arc: each cross-section moves rigidly."""
     radius = LENGTH / turn
     angle = points[:, 1] / radius
     out = radius + points[:, 0]
@@ -47,5 +47,5 @@ def sleeve(gap: float = 0.05) -> Shape:
 
 
 def same_numbers(source: Shape, target: Shape) -> VertexMap:
-    """Vertex i is vertex i."""
+    """Map vertex i to vertex i."""
     return VertexMap.between(source, target, np.arange(source.V), verdict="good")

@@ -3,9 +3,9 @@
 Every command that writes shapes is run for every format, on the samples and the characters of the benchmark. Khronos'
 validator (npm's gltf-validator) checks each glTF file; Blender and three.js (npm's, in Chromium) open every file. The
 meshes, triangles, bones, clips, morph targets and images that they find are compared with the contents of the file, and the
-bounding box with that of the shape that meshmatch reads. Both render it from the same view: at rest, and in the middle of its first
-clip with its first blendshape. The two pictures should cover the same pixels. Pictures are written to OUTPUT/pictures, and
-all together to OUTPUT/sheet.png.
+bounding box with that of the shape that meshmatch reads. Both render it from the same view: at rest, and in the middle of
+its first clip with its first blendshape. The two pictures should cover the same pixels. Pictures are written to
+OUTPUT/pictures, and all together to OUTPUT/sheet.png.
 
 The tools must be installed: `npm install --prefix FOLDER gltf-validator three` and --modules FOLDER/node_modules; Blender as
 for reading files (MESHMATCH_BLENDER); Chromium on the path or named by MESHMATCH_CHROMIUM. Issues that a target file had
