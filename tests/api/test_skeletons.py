@@ -16,7 +16,7 @@ from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import encoded, quarters
-from tests.transfer.rigs import played, tube, write_tube
+from tests.transfer.rigs import posed_verts, tube, write_tube
 from tests.transfer.worn import same_numbers
 
 WIDER = np.array([1.2, 1.0, 1.2])
@@ -53,7 +53,7 @@ def test_a_garment_bends_with_the_body_that_it_sits_on(body: Path, skinned: bool
     assert np.allclose(load_shape(out).verts, result.shape.verts, atol=1e-5)
     rows = slice(0, tube().V)
     for time in (0.0, 0.5, 1.0):
-        away = np.linalg.norm(played(out, "bend", time)[rows] - played(body, "bend", time), axis=1)
+        away = np.linalg.norm(posed_verts(out, "bend", time)[rows] - posed_verts(body, "bend", time), axis=1)
         assert away.mean() < (0.005 if skinned else 0.06), time
     assert [clip.name for clip in read_rig(out, out.read_bytes()).clips] == ["bend"]
 
@@ -74,8 +74,8 @@ def test_both_are_written_into_one_file(body: Path) -> None:
     assert after["skins"][1]["joints"] == after["skins"][0]["joints"]
     V = tube().V
     for time in (0.0, 1.0):
-        now = played(out, "bend", time)
-        assert np.allclose(now[:V], played(body, "bend", time), atol=1e-6)
+        now = posed_verts(out, "bend", time)
+        assert np.allclose(now[:V], posed_verts(body, "bend", time), atol=1e-6)
         assert np.linalg.norm(now[V : 2 * V - 2] - now[: V - 2], axis=1).mean() < 0.06
     found = load_appearance(out, load_shape(out))
     assert [made.name for made in found.materials][-1] == "wool"
@@ -125,15 +125,15 @@ def test_another_garment_follows_by_the_same_map(body: Path) -> None:
 def test_its_own_joints_go_where_the_skin_goes(body: Path) -> None:
     """A tube is laid onto a longer one that is bent and lies: it stands upright, and its clip plays from straight."""
     V, longer = tube().V, 1.5
-    bent = longer * played(body, "bend", 1.0)
+    bent = longer * posed_verts(body, "bend", 1.0)
     lying = bent @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     now = Shape(lying, tube().faces, "body.glb")
     binding = move_skeleton(body, now, is_upright=False)
     out = body.with_name("out.glb")
     save_moved(out, body, now, np.tile(np.eye(3), (V, 1, 1)), binding)
-    assert np.allclose(played(out), bent, atol=1e-4)
+    assert np.allclose(posed_verts(out), bent, atol=1e-4)
     for time in (0.0, 1.0):
-        away = np.linalg.norm(played(out, "bend", time) - longer * played(body, "bend", time), axis=1)
+        away = np.linalg.norm(posed_verts(out, "bend", time) - longer * posed_verts(body, "bend", time), axis=1)
         assert away.mean() < 0.05 * longer
 
 

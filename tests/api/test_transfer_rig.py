@@ -24,7 +24,7 @@ from meshmatch.shapes.formats.gltf_rig import read_rig
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from tests.shapes.painted import encoded, quarters, write_document
-from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, played, tube, volume, weights_of, write_tube
+from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, posed_verts, tube, volume, weights_of, write_tube
 
 UPRIGHT = np.array([[0, 0, 0, 1]] * 2, "f4")
 JOINTS = ("root", "hip", "knee", "foot")
@@ -66,7 +66,7 @@ def test_a_larger_tube_that_lies_and_faces_elsewhere(source: Path) -> None:
     out, result = rigged(source, target)
     raw = Document(out, out.read_bytes())
     assert np.allclose(raw.accessor(0), stands @ lying.T, atol=1e-5)  # the vertices are those of the file
-    assert np.abs(played(out) - stands).max() < 1e-5
+    assert np.abs(posed_verts(out) - stands).max() < 1e-5
     before, after = joints_of(source), joints_of(out)
     assert list(after) == ["source", *NODES[:-1]]
     assert [after[name][:3, 3].tolist() for name in JOINTS] == [
@@ -75,8 +75,8 @@ def test_a_larger_tube_that_lies_and_faces_elsewhere(source: Path) -> None:
     rig = read_rig(out, out.read_bytes())
     assert [rig.names[parent] for parent in rig.parents[1:]] == ["source", "armature", "root", "hip", "knee", "root"]
     for time in (0.0, 0.5, 1.0):
-        expected = 2 * played(source, "bend", time) @ heading.T + shift
-        assert np.abs(played(out, "bend", time) - expected).max() < 1e-4
+        expected = 2 * posed_verts(source, "bend", time) @ heading.T + shift
+        assert np.abs(posed_verts(out, "bend", time) - expected).max() < 1e-4
     assert result.unused == ()
     assert np.allclose(result.weights.matrix.sum(axis=1), 1)
 
@@ -104,16 +104,16 @@ def test_what_the_source_lacks_goes_with_what_it_hangs_from(source: Path) -> Non
 def test_a_target_in_another_pose_plays_the_same_clips(source: Path) -> None:
     """It stands as it came, or as the source; bends from straight; and keeps its volume, its foot on the leg."""
     shape, target = tube(), source.with_name("target.ply")
-    bent = played(source, "bend", 1.0)
+    bent = posed_verts(source, "bend", 1.0)
     save_shape(target, Shape(bent, shape.faces, "target"))
     out, _ = rigged(source, target)
-    assert np.abs(played(out) - bent).max() < 1e-5
-    straight = played(out, "bend", 0.0)
+    assert np.abs(posed_verts(out) - bent).max() < 1e-5
+    straight = posed_verts(out, "bend", 0.0)
     assert np.linalg.norm(straight - shape.verts, axis=1).mean() < 0.03
-    assert np.linalg.norm(played(out, "bend", 1.0) - bent, axis=1).mean() < 0.03
+    assert np.linalg.norm(posed_verts(out, "bend", 1.0) - bent, axis=1).mean() < 0.03
     assert volume(straight, shape.faces) > 0.95 * volume(shape.verts, shape.faces) > 0
     out, result = rigged(source, target, pose="source")
-    assert np.abs(played(out) - straight).max() < 1e-5
+    assert np.abs(posed_verts(out) - straight).max() < 1e-5
     assert {track.node for clip in result.rig.clips for track in clip.tracks} == {4, 6}  # the source's own alone
     angle = Rotation.from_matrix(result.rig.worlds()[4, :3, :3] @ result.rig.worlds()[3, :3, :3].T).magnitude()
     assert angle < np.radians(1)
@@ -128,7 +128,7 @@ def test_a_foot_that_hangs_from_the_root_stays_on_a_shorter_leg(source: Path) ->
     out, _ = rigged(source, target)
     for time in (0.0, 0.37, 1.0):
         turn = Rotation.from_euler("x", BEND * time, degrees=True)
-        assert np.linalg.norm(played(out, "bend", time)[-1] - KNEE - turn.apply([0, 0.5, 0])) < 0.04
+        assert np.linalg.norm(posed_verts(out, "bend", time)[-1] - KNEE - turn.apply([0, 0.5, 0])) < 0.04
 
 
 def test_what_somebody_noted_at_bones_and_clips_arrives(source: Path) -> None:
@@ -403,7 +403,7 @@ def test_a_skeleton_of_its_own_is_replaced(source: Path, stands: float) -> None:
     assert np.abs(load_shape(out).verts - shape.verts).max() < 1e-5
     same = found.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] == 0
     assert same == (stands == 0.0)
-    assert np.linalg.norm(played(out, "bend", 0.0) - tube().verts, axis=1).mean() < 0.03
+    assert np.linalg.norm(posed_verts(out, "bend", 0.0) - tube().verts, axis=1).mean() < 0.03
 
 
 def test_a_clip_of_the_target_takes_in_that_of_its_name(source: Path) -> None:
@@ -428,8 +428,8 @@ def test_a_clip_of_the_target_takes_in_that_of_its_name(source: Path) -> None:
     ]
     moved = [[names[each["target"]["node"]] for each in clip["channels"]] for clip in found["animations"]]
     assert moved[0] == ["lamp", *moved[1]] and "knee" in moved[1]
-    expected = played(source, "bend", 1.0)
-    assert np.abs(played(out, "bend", 1.0) - expected).max() < 1e-4
+    expected = posed_verts(source, "bend", 1.0)
+    assert np.abs(posed_verts(out, "bend", 1.0) - expected).max() < 1e-4
 
 
 @pytest.mark.parametrize("alike", [False, True])
@@ -460,7 +460,7 @@ def test_a_thing_apart_keeps_its_skeleton(source: Path, alike: bool) -> None:
     bones = [found.nodes[joint]["name"] for joint in found.json["skins"][flag["skin"]]["joints"]]
     assert bones == [*(JOINTS if alike else names)]
     assert np.abs(load_shape(out).verts - stood).max() < 1e-5
-    assert np.abs(played(out, "bend", 1.0)[: tube().V] - played(source, "bend", 1.0)).max() < 1e-4
+    assert np.abs(posed_verts(out, "bend", 1.0)[: tube().V] - posed_verts(source, "bend", 1.0)).max() < 1e-4
 
 
 @pytest.mark.parametrize("skinned", [True, False])
@@ -550,7 +550,7 @@ def test_a_mesh_of_an_obj_keeps_its_texture(source: Path) -> None:
     plain, target, shape = source.with_name("plain.ply"), source.with_name("target.obj"), tube()
     save_shape(plain, Shape(2 * shape.verts, shape.faces))
     bare = rigged(source, plain)[0]
-    expected = played(bare, "bend", 1.0)
+    expected = posed_verts(bare, "bend", 1.0)
     uv = np.random.default_rng(0).random((shape.F, 3, 2))
     save_textured(target, TexturedMesh(2 * shape.verts, shape.faces, uv), quarters())
     with target.open("a") as text:
@@ -559,7 +559,7 @@ def test_a_mesh_of_an_obj_keeps_its_texture(source: Path) -> None:
         out, _ = rigged(source, target)
     before, after = load_shape(target), load_shape(out)
     assert after.V > before.V and digest(before.faces) != digest(after.faces)
-    assert np.allclose(played(out, "bend", 1.0)[after.faces], expected[before.faces], atol=1e-5)
+    assert np.allclose(posed_verts(out, "bend", 1.0)[after.faces], expected[before.faces], atol=1e-5)
     given, kept = load_appearance(target, before), load_appearance(out, after)
     assert np.allclose(kept.uv, given.uv, atol=1e-6)
     assert np.array_equal(kept.materials[0].image, given.materials[0].image)
@@ -603,7 +603,7 @@ def test_a_cloud_is_rigged_too(source: Path) -> None:
     save_shape(target, Shape(tube().verts, np.empty((0, 3), int), "cloud"))
     out, _ = rigged(source, target)
     assert load_shape(out).is_cloud
-    assert np.abs(played(out, "bend", 1.0) - played(source, "bend", 1.0)).max() < 0.02
+    assert np.abs(posed_verts(out, "bend", 1.0) - posed_verts(source, "bend", 1.0)).max() < 0.02
 
 
 def test_joints_without_a_vertex_are_named(source: Path) -> None:

@@ -9,7 +9,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf_morphs import read_morphs
 from meshmatch.shapes.shape import Shape
 from tests.cli.conftest import Run, refused, well
-from tests.shapes.characters import VERSIONS, read, said, write_character
+from tests.shapes.characters import VERSIONS, read, read_extensions, write_character
 from tests.shapes.painted import write_gltf
 
 CALLS = {
@@ -32,9 +32,9 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("verb", CALLS)
 def test_a_character_comes_back(run: Run, pair: Path, verb: str) -> None:
-    before = said(Path("b.vrm"))
+    before = read_extensions(Path("b.vrm"))
     assert "wrote out.vrm: " in well(run(verb, *CALLS[verb], "-o", "out.vrm")).err
-    assert said(Path("out.vrm")) == before
+    assert read_extensions(Path("out.vrm")) == before
     well(run(verb, *CALLS[verb], "-o", "out.glb"))
     assert Path("out.glb").read_bytes() == Path("out.vrm").read_bytes()
 
@@ -45,10 +45,10 @@ def test_several_keep_their_suffix(run: Run, pair: Path, verb: str) -> None:
     Path("in").mkdir()
     Path("b.vrm").rename("in/b.vrm")
     write_gltf(Path("in/c.glb"), primitives=[{}] * 3)
-    before = said(Path("in/b.vrm"))
+    before = read_extensions(Path("in/b.vrm"))
     well(run(verb, source, "in", *more, "-o", "out"))
     assert sorted(path.name for path in Path("out").glob("[!.]*")) == ["b.vrm", "c.glb", "transfers.csv"]
-    assert said(Path("out/b.vrm")) == before
+    assert read_extensions(Path("out/b.vrm")) == before
 
 
 def test_a_garment_is_joined(run: Run, pair: Path) -> None:
@@ -80,7 +80,7 @@ def test_what_is_no_character_is_refused(run: Run, pair: Path, verb: str) -> Non
 def test_shapes_of_other_names_are_added(run: Run, pair: Path) -> None:
     shape = load_shape("a.vrm")
     save_shape("wink.ply", Shape(shape.verts + 0.1, shape.faces))
-    before = said(Path("b.vrm"))
+    before = read_extensions(Path("b.vrm"))
     well(run("transfer-shapes", "a.vrm", "b.vrm", "--shapes", "wink.ply", "-o", "out.vrm"))
-    assert said(Path("out.vrm")) == before
+    assert read_extensions(Path("out.vrm")) == before
     assert read_morphs(Path("out.vrm"), Path("out.vrm").read_bytes()).names == ("shape 0", "wink", "a", "o", "smile")

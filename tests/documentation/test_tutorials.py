@@ -39,7 +39,7 @@ from meshmatch.shapes.landmark_files import read_landmark_file
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import quarters
-from tests.transfer.rigs import played
+from tests.transfer.rigs import posed_verts
 
 ROOT = Path(__file__).resolve().parents[2]
 WRITTEN = {
@@ -114,7 +114,7 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     for name in ("walking", "textured", "character"):
         path = tmp_path / f"{name}.glb"
         there = load_shape(path)
-        before, after = played(path), played(path, "walk", 0.25)
+        before, after = posed_verts(path), posed_verts(path, "walk", 0.25)
         heights = there.verts[:, 1] - there.verts[:, 1].min()
         upper = heights > 0.7 * heights.max()
         assert np.linalg.norm(after - before, axis=1)[upper].mean() > 0.05 * heights.max(), name

@@ -105,7 +105,7 @@ def test_the_calibration_of_direct_maps_tells_right_from_wrong() -> None:
         for right in [True] * 60 + [False] * 40
         for leads in [(rng.uniform(0.002, 0.02), 0.03) if right else (rng.uniform(0, 0.004),)]
     ]
-    fitted = any_shapes.fitted_calibration(found)
+    fitted = any_shapes.fit_calibration(found)
     assert fitted.energy > 0 and fitted.lead > 0 and "100 pairs" in fitted.data
     told = [fitted.logit(each["energy"], each["leads"]) > 0 for each in found]
     assert np.mean([a == (each["error"] < 10) for a, each in zip(told, found, strict=True)]) > 0.85
@@ -124,7 +124,7 @@ def test_verdicts_are_counted_by_weights_of_other_classes() -> None:
         for right in [True] * 30 + [False] * 20
     ]
     odd = [{"error": 30.0, "energy": 0.02, "leads": (0.02,), "turns": 1}]  # looks right, and is wrong
-    counts = any_shapes.held_out({"a": pairs[::2], "b": pairs[1::2], "odd": odd})
+    counts = any_shapes.cross_validate({"a": pairs[::2], "b": pairs[1::2], "odd": odd})
     assert (counts["pairs"], counts["right"]) == (51, 30)
     assert counts["good"] > counts["good_over"] == 1 and counts["right_not_poor"] >= 28
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.experiments.bench.beating import beating, paths_of, row, write_frames
+from meshmatch.experiments.bench.beating import move_heart, paths_of, row, write_frames
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -12,7 +12,7 @@ from tests.conftest import icosphere
 
 def test_a_beat_ends_where_it_began() -> None:
     verts = icosphere(3).verts * [60.0, 50, 45]
-    moved = np.array([beating(verts, phase) for phase in (0.0, 1.0, np.pi, 2 * np.pi)])
+    moved = np.array([move_heart(verts, phase) for phase in (0.0, 1.0, np.pi, 2 * np.pi)])
     assert np.allclose(moved[3], moved[0]) and np.linalg.norm(moved[2] - moved[0], axis=1).max() > 8
 
 

@@ -26,12 +26,12 @@ def ball(bones: np.ndarray, name: str = "ball") -> Character:
 def test_same_bones_and_distances_below_the_clothes_by_hand(tmp_path: Path) -> None:
     shape = icosphere(2)
     own, one = np.arange(shape.V), ball(np.where(shape.verts[:, 0] > 0, 1, 0))
-    same = characters.measured(one, one, VertexMap("a", "b", own), tmp_path)
+    same = characters.measure_pair(one, one, VertexMap("a", "b", own), tmp_path)
     assert same == {"bone": 1.0, "cm": 0.0}
     turned = VertexMap(
         "a", "b", np.array([int(np.argmin(np.linalg.norm(shape.verts + v, axis=1))) for v in shape.verts])
     )
-    across = characters.measured(one, one, turned, tmp_path)
+    across = characters.measure_pair(one, one, turned, tmp_path)
     assert across["bone"] < 0.15
     # Half the girth of a ball with a skin of 1.9 m2, by edges a little longer.
     girth = 100 * np.pi * np.sqrt(1.9 / (4 * np.pi))

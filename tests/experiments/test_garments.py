@@ -35,11 +35,11 @@ def patch(tmp_path: Path) -> Path:
 
 def test_a_garment_follows_its_triangles_and_sizes(patch: Path) -> None:
     bound = Bound.read(patch)
-    assert np.allclose(bound.on(BASE).verts, [[1, 0, 0], [0.35, 0.45, 0.4], [0, 0, 2]])
-    assert np.allclose(bound.on(3 * BASE).verts, 3 * bound.on(BASE).verts)
+    assert np.allclose(bound.refit(BASE).verts, [[1, 0, 0], [0.35, 0.45, 0.4], [0, 0, 2]])
+    assert np.allclose(bound.refit(3 * BASE).verts, 3 * bound.refit(BASE).verts)
     lifted = np.tile(np.eye(3, 4), (4, 1, 1))
     lifted[:, :, 3] = [1.0, 2.0, 3.0]
-    assert np.allclose(bound.posed(BASE, lifted).verts, bound.on(BASE).verts + np.array([1, 2, 3]))
+    assert np.allclose(bound.refit_posed(BASE, lifted).verts, bound.refit(BASE).verts + np.array([1, 2, 3]))
 
 
 def test_files_that_do_not_belong_together_are_refused(patch: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -70,7 +70,7 @@ def test_sides_are_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     egg = egg_model()
     both = TrainedModel(replace(egg.card, mirror="auto"), egg.template, egg.inference)
     subjects = kinds.cut_scans("hand", 3, 0, tmp_path / "cache")
-    record, tables = kinds.measured("hand", subjects, Matcher(both))
+    record, tables = kinds.measure_set("hand", subjects, Matcher(both))
     assert [str(table.title).split()[-1] for table in tables] == ["length", "verdict", "sides", "Sides"]
     assert {row["of"]: row["pairs"] for row in record["sides"]} == {
         "left to right": 2,

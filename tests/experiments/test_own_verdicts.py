@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from meshmatch.experiments.bench.own_verdicts import TREATMENTS, fitted_weights, row_of, spoiled
+from meshmatch.experiments.bench.own_verdicts import TREATMENTS, fit_weights, make_spoiled, row_of
 
 
 def test_weights_cost_what_lost_fits_have_more_of() -> None:
     rng = np.random.default_rng(0)
     right = np.arange(80) % 4 > 0
     stretch = np.where(right, rng.uniform(0, 0.3, 80), rng.uniform(0.8, 2.0, 80))
-    found = fitted_weights(np.stack([stretch, rng.uniform(0, 0.1, 80)], 1), right)
+    found = fit_weights(np.stack([stretch, rng.uniform(0, 0.1, 80)], 1), right)
     assert found.stretch > 1 and found.residual >= 0
     assert found.offset - 0.1 * found.stretch > 0 > found.offset - 1.5 * found.stretch
 
@@ -24,7 +24,7 @@ def test_a_row_counts_what_is_right_and_what_is_believed() -> None:
 
 
 def test_a_collection_is_spoiled_as_it_says() -> None:
-    made = spoiled("molars", Path(), 10, 0)
+    made = make_spoiled("molars", Path(), 10, 0)
     assert tuple(made.how.values()) == TREATMENTS
     cut, whole = (made.some.each[f"molars-0{k}"] for k in (4, 0))
     assert cut.cut and cut.shape.edges.open.any() and not whole.shape.edges.open.any()

@@ -10,7 +10,13 @@ from scipy.sparse import csr_array, diags_array
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.experiments.bench import rigs
-from meshmatch.experiments.bench.skinning import from_bones, in_motion, nearest_and_inpainted, skinned, volume
+from meshmatch.experiments.bench.skinning import (
+    distances_from_bones,
+    nearest_and_inpainted,
+    pose_in_motion,
+    skin_vertices,
+    volume,
+)
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.weight_files import SkinWeights
@@ -53,7 +59,7 @@ def test_what_the_target_s_own_rig_does_not_move_has_no_truth(tmp_path: Path, mo
     moved = np.ones(target.shape.V)
     moved[:20] = 0
     target.weights = SkinWeights(csr_array(diags_array(moved) @ target.weights.matrix), target.weights.names)
-    row = rigs.measured(source, target, Matcher("human"))
+    row = rigs.measure_pair(source, target, Matcher("human"))
     assert (row["same"], row["near"], row["nearest"]) == (1.0, 1.0, 1.0)
 
 
@@ -79,19 +85,19 @@ def test_a_shape_that_moves(tmp_path: Path) -> None:
     one = rigs._Character(tmp_path / "a.glb")
     still = replace(one.rig, clips=())
     np.testing.assert_allclose(
-        skinned(shape.verts, one.weights.matrix, still, in_motion(still)), shape.verts, atol=1e-6
+        skin_vertices(shape.verts, one.weights.matrix, still, pose_in_motion(still)), shape.verts, atol=1e-6
     )
     running = replace(one.rig, clips=tuple(replace(clip, name="Run") for clip in one.rig.clips))
     sitting = replace(still, names=tuple("LowerLeg" if name == "knee" else name for name in still.names))
     for rig in (running, sitting):
-        moved = skinned(shape.verts, one.weights.matrix, still, in_motion(rig))
+        moved = skin_vertices(shape.verts, one.weights.matrix, still, pose_in_motion(rig))
         hip = shape.verts[:, 1] < 0.7
         np.testing.assert_allclose(moved[hip], shape.verts[hip], atol=1e-6)
         assert np.abs(moved - shape.verts).max() > 0.3
         assert 0.7 < volume(moved, shape) / volume(shape.verts, shape) < 1.0
     assert volume(2 * shape.verts, shape) == pytest.approx(8 * volume(shape.verts, shape))
     main = np.full(shape.V, one.weights.names.index("hip"))
-    away = from_bones(shape.verts, main, one.rig)
+    away = distances_from_bones(shape.verts, main, one.rig)
     assert away[shape.verts[:, 1] < 0.9].max() <= 0.26 and away.max() > 0.9
 
 

@@ -11,7 +11,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.collections.setting import Record
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench import specimens
-from meshmatch.experiments.bench.specimens import Done, Specimens, by_points, main, scanned, sides_found, start_of
+from meshmatch.experiments.bench.specimens import Done, Specimens, by_points, main, make_scan, sides_found, start_of
 from meshmatch.experiments.makers.molars_and_leaves import MAKERS
 from meshmatch.geometry.frames import Frame
 from meshmatch.maps.vertex_map import VertexMap
@@ -35,12 +35,12 @@ def test_scans_know_where_their_vertices_belong_on_others() -> None:
     made = MAKERS["molars"](2, 0)
     rng = np.random.default_rng(0)
     whole = [Shape(verts, made.faces) for verts in made.verts]
-    a = scanned(whole[0], rng, False, False)
-    b = scanned(whole[0], rng, True, True)
+    a = make_scan(whole[0], rng, False, False)
+    b = make_scan(whole[0], rng, True, True)
     assert a.shape.V != b.shape.V < whole[0].V and b.shape.edges.open.any()
-    there = a.seen_on(b)
+    there = a.true_points_on(b)
     gone = np.isnan(there).any(axis=1)
-    assert 0.1 < gone.mean() < 0.5 and not np.isnan(b.seen_on(a)).any()
+    assert 0.1 < gone.mean() < 0.5 and not np.isnan(b.true_points_on(a)).any()
     back = start_of(b, a)
     assert back.mirrored and np.abs(back.scale - 1) < 1e-6
     assert np.abs(back.apply(there[~gone]) - a.shape.verts[~gone]).max() < 0.2

@@ -12,7 +12,7 @@ import pytest
 
 from meshmatch.errors import InputError, MeshmatchError
 from meshmatch.experiments.bench import speed
-from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, sized, split
+from meshmatch.experiments.bench.speed import Case, cost_of, keep_to_cores, main, measure, resize, split
 from meshmatch.maps.files import load_map
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.repair import repair
@@ -35,16 +35,18 @@ def python(code: str) -> list[str]:
 def test_an_earlier_run_stands_beside_this_one(tmp_path: Path) -> None:
     path = tmp_path / "before.json"
     path.write_text('{"values": {"cases": [{"case": "help", "wall": 2, "cpu": 0.5, "gigabytes": 0}]}}')
-    row = speed.compared({"case": "help", "wall": 1.0, "cpu": 1.0, "gigabytes": 1.0}, speed.earlier(path)["help"])
+    row = speed.add_comparison(
+        {"case": "help", "wall": 1.0, "cpu": 1.0, "gigabytes": 1.0}, speed.read_earlier(path)["help"]
+    )
     assert (row["wall_before"], row["wall_ratio"], row["cpu_ratio"]) == (2.0, 0.5, 2.0)
     assert "gigabytes_ratio" not in row
     path.write_text("[]")
     with pytest.raises(InputError, match="holds no run"):
-        speed.earlier(path)
+        speed.read_earlier(path)
 
 
 def test_the_numbers_of_the_last_release_are_of_cases_that_are_still_run() -> None:
-    kept = speed.earlier(Path(__file__).parents[2] / "docs" / "results" / "speed.json")
+    kept = speed.read_earlier(Path(__file__).parents[2] / "docs" / "results" / "speed.json")
     assert "pair" in kept and set(kept) <= set(speed.CASES)
 
 
@@ -65,12 +67,12 @@ def test_a_split_surface_is_the_same_surface(torus: Shape) -> None:
 
 
 def test_shapes_come_in_the_size_that_is_asked(sphere: Shape) -> None:
-    assert sized(sphere, 642) is sphere
-    assert sized(sphere, 600) is sphere  # near enough
-    assert 300 <= sized(sphere, 320).V <= 340
-    finer = sized(sphere, 2000)
+    assert resize(sphere, 642) is sphere
+    assert resize(sphere, 600) is sphere  # near enough
+    assert 300 <= resize(sphere, 320).V <= 340
+    finer = resize(sphere, 2000)
     assert 1900 <= finer.V <= 2200 and finer.area == pytest.approx(sphere.area, rel=0.01)
-    assert not repair(sized(sphere, 2000)).notes
+    assert not repair(resize(sphere, 2000)).notes
 
 
 def test_samples_are_changed_as_a_case_asks(sphere: Shape) -> None:

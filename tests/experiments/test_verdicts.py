@@ -132,19 +132,19 @@ def test_weights_are_found() -> None:
         {"verdict": "good", "fit": "good", "signs": list(sign), "error": 20.0 if bad else 1.0}
         for sign, bad in zip(signs, wrong, strict=True)
     ]
-    weights, offset = verdicts.fitted_weights(found)
+    weights, offset = verdicts.fit_weights(found)
     assert weights[0] > 10 * abs(weights[1]) and -offset / weights[0] == pytest.approx(0.3, abs=0.1)
     astray = {"verdict": "poor", "fit": "good", "signs": [-3.0, 0.0], "error": 30.0}  # by the target's fit
-    again, same = verdicts.fitted_weights([*found, *[astray] * 50])
+    again, same = verdicts.fit_weights([*found, *[astray] * 50])
     assert (again.tolist(), same) == (weights.tolist(), offset)
 
 
 def test_weights_of_few_cases_stay_near_those_given() -> None:
     given = Calibration(weights=(2.0, 3.0), offset=-1.0, data="", seeds=(), date="")
     few = [{"verdict": "good", "fit": "good", "signs": [0.1 * k, 0.0], "error": 1.0} for k in range(5)]
-    weights, offset = verdicts.fitted_weights(few, given)
+    weights, offset = verdicts.fit_weights(few, given)
     assert weights == pytest.approx(given.weights, abs=0.5) and offset < given.offset
-    alone, _ = verdicts.fitted_weights(few)
+    alone, _ = verdicts.fit_weights(few)
     assert abs(alone).max() < 1.0
 
 

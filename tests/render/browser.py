@@ -32,11 +32,11 @@ def chromium() -> str:
 
 @dataclass(eq=False)
 class Opened:
-    """An open page, with its console messages and errors (``said``) and requested URLs (``asked``)."""
+    """An open page, with its console messages and errors (``said``) and requested URLs (``requests``)."""
 
     page: Any
     said: list[str] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
 
     def state(self) -> dict[str, Any]:
         return dict(self.page.evaluate("meshmatch.state()"))
@@ -75,16 +75,16 @@ def opened(running: Any, path: Path, **options: Any) -> Iterator[Opened]:
     seen = Opened(page)
     page.on("console", lambda message: seen.said.append(f"{message.type}: {message.text}"))
     page.on("pageerror", lambda error: seen.said.append(f"error: {error}"))
-    page.on("request", lambda request: seen.asked.append(request.url))
+    page.on("request", lambda request: seen.requests.append(request.url))
     page.goto(path.resolve().as_uri())
     page.wait_for_selector("html[data-ready]", timeout=60_000)
     yield seen
     assert seen.said == []
-    assert seen.asked == [path.resolve().as_uri()]
+    assert seen.requests == [path.resolve().as_uri()]
     context.close()
 
 
-def nameless(view: Opened) -> list[str]:
+def unnamed_controls(view: Opened) -> list[str]:
     """Return the controls of a page without an accessible name for screen readers."""
     said = "e => e.ariaLabel || e.innerText || [...(e.labels ?? [])].map(l => l.innerText).join() || ''"
     used = view.page.locator("button, input, select, summary, [role=application]").all()

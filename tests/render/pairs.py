@@ -21,13 +21,13 @@ class Pair:
     back: VertexMap
 
 
-def itself(shape: Shape) -> Pair:
+def identical_pair(shape: Shape) -> Pair:
     """Pair a shape with itself."""
     same = VertexMap.identity(shape)
     return Pair(shape, shape, same, same)
 
 
-def stirred(
+def shuffled_pair(
     shape: Shape, name: str = "stirred", verdict: str = "good", reasons: tuple[str, ...] = (), lean: float = 0.0
 ) -> Pair:
     """Pair a shape with a copy that is scaled, translated, z up instead of y up, and has permuted vertices.

@@ -12,7 +12,7 @@ from PIL import Image
 from meshmatch.errors import OptionError
 from meshmatch.render.viewer.single_pages import MAX_MODES, Varying, write_atlas_page
 from meshmatch.shapes.shape import Shape
-from tests.render.browser import PHONE, nameless, opened
+from tests.render.browser import PHONE, opened, unnamed_controls
 from tests.render.pages import read
 
 NAMES = ("a </script>", "b & c", "é")
@@ -111,7 +111,7 @@ def test_figures_are_on_the_page(running: Any, tmp_path: Path, make_sphere: Call
     shown = replace(varying(make_sphere(1)), figures=[red, tmp_path / "b.svg"])
     write_atlas_page(path, shown, rotation=np.eye(3), title="balls")
     with opened(running, path) as seen:
-        assert nameless(seen) == []
+        assert unnamed_controls(seen) == []
         assert seen.page.locator("#figures img").evaluate_all("all => all.map(i => i.naturalWidth)") == [60, 9]
         seen.page.click("#figures button")
         pixels = np.asarray(Image.open(seen.picture(tmp_path / "1.png")).convert("RGB"))
@@ -186,4 +186,4 @@ def test_words_can_be_read(
             for target in ("#title", "#shape", "#mode-0", "#score-1", "#play", "#high"):
                 box = seen.page.locator(target).bounding_box()
                 assert box["x"] >= 0 and box["x"] + box["width"] <= seen.page.viewport_size["width"], target
-            assert nameless(seen) == []
+            assert unnamed_controls(seen) == []

@@ -24,14 +24,14 @@ from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.colors import UNKNOWN
 from meshmatch.shapes.shape import Shape
 from tests.render.pages import Page, read, unpacked
-from tests.render.pairs import Pair, bump, itself, stirred
+from tests.render.pairs import Pair, bump, identical_pair, shuffled_pair
 
 HOSTILE = "</script><script>alert(1)</script ><script /x><!--<script <!--packed--><b a='\"'>&amp;\u2028\u202e.ply"
 
 
 @pytest.fixture(scope="module")
 def pair(make_sphere: Callable[[int], Shape]) -> Pair:
-    return stirred(bump(make_sphere(2)))
+    return shuffled_pair(bump(make_sphere(2)))
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_a_large_mesh_is_drawn_coarser_and_says_so(
     tmp_path: Path, make_sphere: Callable[[int], Shape], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 900)
-    fine = stirred(bump(make_sphere(4)))
+    fine = shuffled_pair(bump(make_sphere(4)))
     path = tmp_path / "page.html"
     report = write_page(path, fine.source, fine.target, fine.there, fine.back)
     assert all(200 < drawn <= 900 for drawn in report.drawn)
@@ -328,12 +328,12 @@ def look_of(shape: Shape, pixels: np.ndarray | None, **material: Any) -> Appeara
 
 def worn_page(folder: Path, shape: Shape, look: Appearance, side: Literal["source", "target"] = "source") -> Page:
     """Of a shape that is both source and target, with one look."""
-    return page_of(folder / "page.html", itself(shape), looks=Looks(side, (look, look)))
+    return page_of(folder / "page.html", identical_pair(shape), looks=Looks(side, (look, look)))
 
 
 def test_a_texture_keeps_its_corners_and_its_image(tmp_path: Path, cube: Shape) -> None:
     look = look_of(cube, image(), wrap=("clamp", "mirror"), nearest=True, alpha="mask", cutoff=0.25)
-    page = page_of(tmp_path / "page.html", itself(cube), looks=Looks("source", (look, look), look))
+    page = page_of(tmp_path / "page.html", identical_pair(cube), looks=Looks("source", (look, look), look))
     words, arrays = page.words, page.arrays
     assert (words["look"], words["own"]) == ({"kind": "texture", "side": "source"}, True)
     skin = words["source"]["look"]

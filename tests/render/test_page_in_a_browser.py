@@ -13,8 +13,8 @@ from meshmatch.render.viewer.looks import Looks
 from meshmatch.render.viewer.page import write_page
 from meshmatch.shapes.appearance import Appearance, Material
 from meshmatch.shapes.shape import Shape
-from tests.render.browser import PHONE, Opened, nameless, opened
-from tests.render.pairs import Pair, bump, stirred
+from tests.render.browser import PHONE, Opened, opened, unnamed_controls
+from tests.render.pairs import Pair, bump, shuffled_pair
 
 pytestmark = pytest.mark.slow
 MODES = ["matches", "look", "own", "confidence", "plain"]
@@ -22,7 +22,7 @@ MODES = ["matches", "look", "own", "confidence", "plain"]
 
 @pytest.fixture(scope="module")
 def pair(make_sphere: Callable[[int], Shape]) -> Pair:
-    return stirred(bump(make_sphere(2)), "stirred.ply", "fair", ("stirred.ply: the nose is <b>far</b>",), 0.2)
+    return shuffled_pair(bump(make_sphere(2)), "stirred.ply", "fair", ("stirred.ply: the nose is <b>far</b>",), 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +184,7 @@ def saturation(pixels: np.ndarray) -> float:
 
 def test_a_turned_shape_stays_in_its_panel(running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path) -> None:
     ball = make_sphere(2)
-    wide = stirred(Shape(ball.verts * (2.0, 2.0, 0.3), ball.faces, "wide"))
+    wide = shuffled_pair(Shape(ball.verts * (2.0, 2.0, 0.3), ball.faces, "wide"))
     write_page(tmp_path / "page.html", wide.source, wide.target, wide.there, wide.back)
     with opened(running, tmp_path / "page.html") as view:
         box = view.page.locator("#source .view").bounding_box()
@@ -248,7 +248,7 @@ def test_help_and_verdict_open(running: Any, file: Path) -> None:
 
 def test_everything_that_can_be_used_has_a_name(running: Any, file: Path) -> None:
     with opened(running, file) as view:
-        assert nameless(view) == []
+        assert unnamed_controls(view) == []
 
 
 def test_a_finger_taps_on_a_phone(running: Any, file: Path, pair: Pair, artefacts: Path) -> None:
@@ -305,7 +305,7 @@ def test_a_coarser_mesh_keeps_the_numbers_of_the_file(
     running: Any, make_sphere: Callable[[int], Shape], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("meshmatch.render.viewer.page.MAX_VERTICES", 500)
-    fine = stirred(bump(make_sphere(4)), "fine.ply")
+    fine = shuffled_pair(bump(make_sphere(4)), "fine.ply")
     write_page(tmp_path / "page.html", fine.source, fine.target, fine.there, fine.back)
     with opened(running, tmp_path / "page.html") as view:
         assert "of 2,562 vertices" in view.page.locator("#target .count").inner_text()

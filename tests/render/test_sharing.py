@@ -11,12 +11,12 @@ from meshmatch.render.viewer.looks import Looks, share_look
 from meshmatch.shapes.appearance import Appearance, Material, vertex_colors_alone
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.shape import Shape
-from tests.render.pairs import Pair, bump, stirred
+from tests.render.pairs import Pair, bump, shuffled_pair
 
 
 @pytest.fixture(scope="module")
 def pair(make_sphere: Callable[[int], Shape]) -> Pair:
-    found = stirred(bump(make_sphere(3)))
+    found = shuffled_pair(bump(make_sphere(3)))
     sure = {"confidence": np.ones(found.source.V, np.float32)}
     there = VertexMap.between(found.source, found.target, found.there.index, **sure)
     return Pair(found.source, found.target, there, VertexMap.between(found.target, found.source, found.back.index))

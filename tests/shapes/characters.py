@@ -173,7 +173,7 @@ def toon_images(document: Document, number: int = 0) -> dict[str, str]:
     return {word: image_of(document, texture["index"]) for word, texture in found.items()}
 
 
-def said(path: Path) -> dict[str, Any]:
+def read_extensions(path: Path) -> dict[str, Any]:
     """Return the contents of the extensions, but for toon materials, with names in place of indices."""
     document = read(path)
     json = document.json

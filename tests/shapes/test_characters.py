@@ -19,7 +19,7 @@ from meshmatch.shapes.formats.gltf_morphs import read_morphs, with_morphs
 from meshmatch.shapes.formats.gltf_vrm import check_character
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_coordinates
-from tests.shapes.characters import VERSIONS, image_of, read, said, toon_images, write_character
+from tests.shapes.characters import VERSIONS, image_of, read, read_extensions, toon_images, write_character
 from tests.shapes.painted import encoded, quarters, write_gltf
 from tests.shapes.test_dressed_files import apart
 
@@ -53,8 +53,8 @@ def toon(path: Path) -> dict[str, Any]:
 
 @pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")
 def test_a_texture_is_what_the_lit_and_the_shaded_side_show(character: Path) -> None:
-    before, out = said(character), dressed(character)
-    assert said(out) == before
+    before, out = read_extensions(character), dressed(character)
+    assert read_extensions(out) == before
     document = read(out)
     shown = toon_images(document)
     assert (shown["_MainTex"], shown["_ShadeTexture"]) == ("new", "new")
@@ -144,7 +144,7 @@ def test_a_material_that_is_needed_twice_is_tinted_twice(tmp_path: Path) -> None
     body["material"], body["attributes"]["TEXCOORD_1"] = 1, 1
     path.write_bytes(editor.to_bytes())
     out = dressed(path)
-    assert said(out)["tints"]["oh"] == ["iris", "iris"]
+    assert read_extensions(out)["tints"]["oh"] == ["iris", "iris"]
     assert len(read(out).json["materials"]) == 3
 
 
@@ -156,11 +156,11 @@ def added(shape: Shape, *names: str) -> BlendShapes:
 
 def test_expressions_name_the_morph_targets_that_they_did(character: Path) -> None:
     """Also those behind one that is replaced, and where a mesh becomes two."""
-    shape, before = load_shape(character), said(character)
+    shape, before = load_shape(character), read_extensions(character)
     glb = with_morphs(read(character), shape, added(shape, "smile", "new", "a"), np.eye(3))
     out = character.with_name("out.vrm")
     out.write_bytes(glb)
-    after = said(out)
+    after = read_extensions(out)
     moved = [(name, "smile 0.700", weight) for name, _, weight in next(iter(before["binds"].values()))]
     first, *others = before["binds"]
     assert after["binds"] | {first: 0, others[-1]: 0} == before["binds"] | {first: 0, others[-1]: 0}
@@ -178,22 +178,22 @@ def test_names_of_morph_targets_may_stand_in_primitives(character: Path) -> None
 
 
 def test_colors_are_told_where_a_toon_material_shows_none(character: Path) -> None:
-    before, out, shape = said(character), character.with_name("out.vrm"), load_shape(character)
+    before, out, shape = read_extensions(character), character.with_name("out.vrm"), load_shape(character)
     painted = Shape(shape.verts, shape.faces, "square", np.tile([1.0, 0, 0, 1], (shape.V, 1)))
     with pytest.warns(MeshmatchWarning, match="do not show vertex colors on the toon material skin of square.vrm"):
         save_colored(out, painted, character, np.eye(3))
-    assert said(out) == before
+    assert read_extensions(out) == before
     np.testing.assert_allclose(load_shape(out).colors, painted.colors, atol=1e-6)
 
 
 def test_a_garment_in_a_character(character: Path, tmp_path: Path) -> None:
     """It gets a material of its own and is seen; without --join there would be no character."""
-    garment, out, before = tmp_path / "coat.glb", tmp_path / "out.vrm", said(character)
+    garment, out, before = tmp_path / "coat.glb", tmp_path / "out.vrm", read_extensions(character)
     write_gltf(garment, images=[encoded(quarters())], primitives=[{"material": 0}])
     shape = load_shape(garment)
     turns = np.tile(np.eye(3), (shape.V, 1, 1))
     save_moved(out, garment, shape, turns, into=character)
-    after = said(out)
+    after = read_extensions(out)
     coat = read(out).json["materials"][-1]
     assert (len(read(out).json["materials"]), load_shape(out).V) == (3, 16)
     assert {key: after[key] for key in ("meta", "bones", "binds", "springs")} == {

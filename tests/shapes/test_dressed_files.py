@@ -16,7 +16,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
 from tests.blender_at_hand import stand_in
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_document, write_gltf
-from tests.transfer.rigs import played, write_tube
+from tests.transfer.rigs import posed_verts, write_tube
 
 PLAIN = BakedMaterial(quarters(8), name="paint")
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -77,7 +77,7 @@ def test_a_rigged_glb_keeps_its_skin_and_clips(tmp_path: Path) -> None:
         *range(shape.V)
     ]
     for time in (0.0, 0.6):
-        np.testing.assert_allclose(played(out, "bend", time), played(path, "bend", time)[vertex], atol=1e-6)
+        np.testing.assert_allclose(posed_verts(out, "bend", time), posed_verts(path, "bend", time)[vertex], atol=1e-6)
     np.testing.assert_allclose(load_coordinates(out, load_shape(out)), apart(load_shape(path)), atol=1e-6)
     [material] = load_appearance(out, load_shape(out)).materials
     assert material.name == "paint"
@@ -381,7 +381,7 @@ def test_colors_alone(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(again.colors, colors, atol=1e-6)
     np.testing.assert_array_equal(again.faces, shape.faces)
     if name == "tube.glb":
-        np.testing.assert_allclose(played(out, "bend", 0.6), played(path, "bend", 0.6), atol=1e-6)
+        np.testing.assert_allclose(posed_verts(out, "bend", 0.6), posed_verts(path, "bend", 0.6), atol=1e-6)
     elif name == "leaf.obj":
         same = [line for line in out.read_text().split("\n") if not line.startswith("v ")]
         assert same == [line for line in LEAF.decode().split("\n") if not line.startswith("v ")]

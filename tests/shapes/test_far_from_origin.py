@@ -21,7 +21,7 @@ from meshmatch.shapes.formats.gltf_write import choose_origin, write_morphs
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.transfer.bake import BakeOptions
-from tests.render.pairs import Pair, bump, stirred
+from tests.render.pairs import Pair, bump, shuffled_pair
 from tests.render.test_page import page_of
 
 PLACES = {"UTM": (512345.678, 4612345.678, 120.25), "millimetres": (5e6, -7e6, 10.0), "one axis": (0.0, 0.0, 1e8)}
@@ -125,7 +125,7 @@ def test_a_baked_texture_shows_the_colors_that_were_there(tmp_path: Path, make_s
 
 @pytest.mark.parametrize("place", list(PLACES))
 def test_a_page_does_not_depend_on_the_place(tmp_path: Path, make_sphere, place: str) -> None:
-    near = stirred(bump(make_sphere(2)))
+    near = shuffled_pair(bump(make_sphere(2)))
     shapes = [placed(shape, place) for shape in (near.source, near.target)]
     far = Pair(
         *shapes,

@@ -22,7 +22,7 @@ from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.bake import colors_of_vertices
 from tests.shapes.morphs import SCALE, TURN, UP, write_morphs
 from tests.shapes.painted import CORNERS, FACES, glb, parts
-from tests.transfer.rigs import BEND, played, write_tube
+from tests.transfer.rigs import BEND, posed_verts, write_tube
 
 SPIN = Rotation.from_rotvec([0.4, -1.2, 0.8])
 GROWN = 3.0
@@ -78,7 +78,7 @@ def test_a_skinned_mesh_stands_and_bends(tmp_path: Path) -> None:
     with pytest.warns(MeshmatchWarning, match=r"the joints of tube.glb stay where they are in moved.glb: `meshmatch"):
         save_moved(out, path, Shape(shape.verts + shift, shape.faces), np.tile(np.eye(3), (shape.V, 1, 1)))
     assert np.allclose(load_shape(out).verts, shape.verts + shift, atol=1e-5)
-    before, after = played(path, "bend", 1.0), played(out, "bend", 1.0)
+    before, after = posed_verts(path, "bend", 1.0), posed_verts(out, "bend", 1.0)
     knee = Rotation.from_euler("x", BEND - 40, degrees=True)
     low, high = shape.verts[:, 1] < 0.7, load_shape(path).verts[:, 1] > 1.3
     assert np.allclose((after - before)[low], shift, atol=1e-5)

@@ -104,7 +104,7 @@ def write_tube(path: Path, *, stands: float = 0.0, clips: bool = True, **more: A
     return shape
 
 
-def played(path: Path, clip: str = "", time: float = 0.0) -> np.ndarray:
+def posed_verts(path: Path, clip: str = "", time: float = 0.0) -> np.ndarray:
     """Return the vertices at a time of a clip, or in the file's pose without one, by linear blend skinning."""
     document = Document(path, path.read_bytes())
     for animation in document.json.get("animations", []):

@@ -213,7 +213,7 @@ def measure(folder: Path, pair: tuple[str, str], model: str, seed: int) -> dict[
     return best | {"one_way": None if found.before is None else row(found.before)}
 
 
-def judged(row: dict[str, Any]) -> dict[str, Any]:
+def judge_again(row: dict[str, Any]) -> dict[str, Any]:
     """Replace a pair's verdict by that of the current calibration, which may be newer than the pairs in a work folder.
 
     Pairs that a refined fit judged keep their verdict.
@@ -278,7 +278,7 @@ def _all_rows(found: _Found) -> list[dict[str, Any]]:
     return [row for some in found.values() for row in some]
 
 
-def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.01) -> DirectCalibration:
+def fit_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, ridge: float = 0.01) -> DirectCalibration:
     """Fit the calibration by logistic regression on right and wrong maps made without a model.
 
     ``most`` caps the leads, and ``ridge`` weighs the L2 penalty on the weights.
@@ -298,12 +298,12 @@ def fitted_calibration(found: Sequence[dict[str, Any]], most: float = 0.008, rid
     return DirectCalibration(offset=float(offset), energy=energy, lead=lead, most=most, data=data, date=today)
 
 
-def held_out(found: _Found) -> dict[str, Any]:
+def cross_validate(found: _Found) -> dict[str, Any]:
     """Count verdicts by leave-one-class-out cross-validation: each class is judged by weights fitted to the others."""
     counts = {"pairs": 0, "right": 0, "good": 0, "good_over": 0, "right_not_poor": 0}
     for name, own in found.items():
         others = [row for other, some in found.items() if other != name for row in some]
-        calibration = fitted_calibration(others)
+        calibration = fit_calibration(others)
         for row in own:
             verdict = judge_direct(row["energy"], row["leads"], calibration, row["turns"])[0]
             right = row["error"] < MAX_ERROR
@@ -325,7 +325,7 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     errors = np.array([each["error"] for each in found])
     good = np.array([each["verdict"] == "good" for each in found])
     far_off = errors > LARGE_ERROR
-    told = far_off & np.array([each["ambiguous"] or each["verdict"] == "poor" for each in found])
+    flagged = far_off & np.array([each["ambiguous"] or each["verdict"] == "poor" for each in found])
     worst = int(errors.argmax())
     return {
         "class": name,
@@ -333,7 +333,7 @@ def row_of(name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "good": int(good.sum()),
         "good_over": int((good & (errors > MAX_ERROR)).sum()),
         "far_off": int(far_off.sum()),
-        "told": int(told.sum()),
+        "told": int(flagged.sum()),
         "worst": found[worst]["pair"],
         "worst_error": float(errors[worst]),
         "cpu": float(np.mean([each["cpu"] for each in found])),
@@ -345,13 +345,13 @@ def _with_calibrations(report: runner.Report, found: _Found) -> runner.Report:
     doubtful = {name: [row for row in some if row["one_way"]] for name, some in found.items()}
     one_way = {name: [row["one_way"] or row for row in some] for name, some in found.items()}
     fits = {"one way": one_way, "both ways, where one way leaves doubt": doubtful}
-    rows = [{"maps": which, **held_out(each)} for which, each in fits.items()]
+    rows = [{"maps": which, **cross_validate(each)} for which, each in fits.items()]
     table = runner.table("Verdicts by weights that other classes gave", rows, _HELD_OUT_COLUMNS)
     return replace(
         report,
         record={**report.record, "held out": rows},
         tables=[*report.tables, table],
-        notes=[*report.notes, *(f"{which}: {fitted_calibration(_all_rows(each))}" for which, each in fits.items())],
+        notes=[*report.notes, *(f"{which}: {fit_calibration(_all_rows(each))}" for which, each in fits.items())],
     )
 
 
@@ -415,7 +415,7 @@ def main(
         found[name] = []
         for pair in runner.track(pairs, name):
             row = runner.cached_in(work, f"{name}-{'-'.join(pair)}", asked, partial(measure, folder, pair, model, seed))
-            found[name].append(judged(row))
+            found[name].append(judge_again(row))
     everything = _all_rows(found)
     rows = [*(row_of(name, some) for name, some in found.items()), row_of("all", everything)]
     if any(each["error"] != each["as_marked"] for each in everything):

@@ -108,7 +108,7 @@ METHODS: dict[str, Callable[[Choices], list[Baseline]]] = {
 """By method name, a function that returns its rows; `ModelError` or `TemplateError` if its model cannot be read."""
 
 
-def measured(row: Baseline, bench: BenchSet, folder: Path, limit: int | None, **how: Any) -> dict[str, Any]:
+def measure_baseline(row: Baseline, bench: BenchSet, folder: Path, limit: int | None, **how: Any) -> dict[str, Any]:
     """Return one result, read from the folder or measured and written there. ``how`` is passed on to `run_set`.
 
     Raises
@@ -163,7 +163,7 @@ def main(
                 skipped[row.label] = row.missing
                 continue
             runner.log(f"{row.label} on {bench.name}")
-            found = measured(row, bench, output, limit_pairs, cache=cache, jobs=jobs, threads=threads)
+            found = measure_baseline(row, bench, output, limit_pairs, cache=cache, jobs=jobs, threads=threads)
             names = {"set": bench.name, "name": row.name, "label": row.label}
             scores = found["scores"]
             share = {"measured": f"{scores['pairs']} of {found['of']}", "failures": len(scores["failed"])}

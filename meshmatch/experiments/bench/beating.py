@@ -34,7 +34,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def beating(verts: Float[Floats, "V 3"], phase: float) -> Float[Floats, "V 3"]:
+def move_heart(verts: Float[Floats, "V 3"], phase: float) -> Float[Floats, "V 3"]:
     """Return the points of a heart at a phase of its beat, in radians."""
     center = verts.mean(axis=0)
     axes = np.linalg.svd(verts - center, full_matrices=False)[2]
@@ -60,7 +60,7 @@ def write_frames(folder: Path, heart: Shape, count: int, seed: int) -> Float[Flo
     """Write the frames of one beat, ``frame1.ply`` to ``frameT.ply``; return the heart's vertices at each frame."""
     make_folder(folder)
     rng = np.random.default_rng(seed)
-    true = np.stack([beating(heart.verts, 2 * np.pi * k / count) for k in range(count)])
+    true = np.stack([move_heart(heart.verts, 2 * np.pi * k / count) for k in range(count)])
     for number, verts in enumerate(true):
         order = rng.permutation(heart.V)
         faces = np.argsort(order)[heart.faces][rng.permutation(heart.F)]
@@ -92,7 +92,7 @@ def row(
     }
 
 
-def tracked(fits: Path, work: Path, way: str) -> tuple[Floats, Ints]:
+def track_template(fits: Path, work: Path, way: str) -> tuple[Floats, Ints]:
     """Return the template's vertices on every frame, smoothed as ``way`` says, and its faces."""
     with tempfile.TemporaryDirectory(dir=work) as folder:
         out = Path(folder, "points")
@@ -124,7 +124,7 @@ def main(
         cpu = _cpu_seconds() - began
         rows = []
         for way in ("as fitted", "--smooth", "--cycle"):
-            points, faces = tracked(place / "fits", place, way)
+            points, faces = track_template(place / "fits", place, way)
             rows.append(row(way, points, paths_of(points[0], shape, true), faces))
     note = f"{frames} frames fitted in {cpu:.0f} CPU s (less where fits were reused)"
     return runner.Report(

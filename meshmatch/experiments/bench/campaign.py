@@ -229,7 +229,7 @@ class People:
         return which, lambda points, _: (np.linalg.norm(points[:, None] - middles, axis=2) > sizes).all(1)
 
 
-def measured(body: Body, fit: Fit, template: Template) -> dict[str, Any]:
+def measure_fit(body: Body, fit: Fit, template: Template) -> dict[str, Any]:
     """Return the errors of a fit, its verdict and its features."""
     unit = CM_PER_UNIT / np.sqrt(Shape(body.places, template.shape.faces).area)
     cm = unit * np.linalg.norm(fit.points_in_file - body.places, axis=1)
@@ -268,14 +268,14 @@ def summarize_by_pose(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         ]
         if some:
             errors = np.array([row["error"] for row in some])
-            told = np.array([row["verdict"] != "poor" for row in some])
-            off = errors > _WRONG_CM
+            believed = np.array([row["verdict"] != "poor" for row in some])
+            is_wrong = errors > _WRONG_CM
             row = {"pose": pose, "bodies": len(some), "mean": errors.mean(), "median": np.median(errors)}
-            found.append(row | {"off": off.mean(), "not_poor": int((off & told).sum())})
+            found.append(row | {"off": is_wrong.mean(), "not_poor": int((is_wrong & believed).sum())})
     return found
 
 
-def kept(row: dict[str, Any]) -> str:
+def format_body(row: dict[str, Any]) -> str:
     """Format a body as one line, which `finished_bodies` parses."""
     error = f"{row['error']:.2f}" if "error" in row else ""
     return "; ".join([str(row["seed"]), str(row["number"]), row["pose"], row["cut"], error, row["verdict"]])
@@ -319,7 +319,7 @@ def main(
         row: dict[str, Any] = {"seed": people.seed, "number": number, **body.words, "V": body.shape.V}
         try:
             fit = matcher.fit(body.shape)
-            row |= measured(body, fit, template)
+            row |= measure_fit(body, fit, template)
             write_fit(output / "fits" / f"{people.seed}-{number}.safetensors", fit)
         except MeshmatchError as error:
             row |= {"verdict": REFUSED, "reasons": [error.message]}
@@ -334,6 +334,6 @@ def main(
         runner.table(f"{len(rows)} bodies, of which {refused} refused", found, columns),
         runner.table("By pose, of bodies of which no more than holes is missing", poses, _POSE_COLUMNS),
     ]
-    lines = [kept(row) for row in sorted(rows, key=lambda row: (row["seed"], row["number"]))]
+    lines = [format_body(row) for row in sorted(rows, key=lambda row: (row["seed"], row["number"]))]
     record = {"bodies": len(rows), "refused": refused, "bands": found, "poses": poses, "rows": lines}
     return runner.Report(record, tables)

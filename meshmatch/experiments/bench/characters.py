@@ -21,7 +21,7 @@ from typer import Option
 
 from meshmatch.api.matcher import Matcher
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.pairs import VERDICTS, matched
+from meshmatch.experiments.bench.pairs import VERDICTS, match_by_fits
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import ordered_pairs
 from meshmatch.experiments.makers.character_designs import Character, clothed_people, people_in_contact
@@ -44,7 +44,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def measured(source: Character, target: Character, found: VertexMap, cache: Path | None) -> dict[str, float]:
+def measure_pair(source: Character, target: Character, found: VertexMap, cache: Path | None) -> dict[str, float]:
     """Return the error in centimeters on the naked body, and the share of vertices mapped to the same bone."""
     known = np.arange(0, target.body.V, _STRIDE)
     at = np.flatnonzero(source.places % _STRIDE == 0)
@@ -58,8 +58,8 @@ def row_of(group: str, characters: Sequence[Character], matcher: Matcher, cache:
     """Match all ordered pairs of a group and return its table row."""
     of = {each.shape.name: each for each in characters}
     shapes = {name: each.shape for name, each in of.items()}
-    fits, found = matched(matcher, shapes, ordered_pairs(of), group)
-    errors = {(a, b): measured(of[a], of[b], each.map, cache) for (a, b), each in found.items()}
+    fits, found = match_by_fits(matcher, shapes, ordered_pairs(of), group)
+    errors = {(a, b): measure_pair(of[a], of[b], each.map, cache) for (a, b), each in found.items()}
     bone, cm = ([each[name] for each in errors.values()] for name in ("bone", "cm"))
     verdicts = Counter(each.verdict for each in found.values())
     seconds = [each.seconds for each in found.values()]

@@ -29,7 +29,7 @@ from meshmatch.arrays import Int, Ints
 from meshmatch.collections.collection import Collection
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.pairs import matched_directly
+from meshmatch.experiments.bench.pairs import match_directly
 from meshmatch.experiments.bench.scores import evaluate_set
 from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, load_set, ordered_pairs
 from meshmatch.maps.vertex_map import VertexMap
@@ -74,13 +74,13 @@ def heart_errors(shapes: Shapes, truth: Truth, maps: Mapping[Pair, VertexMap]) -
     }
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def read_fits(folder: Path) -> dict[str, bytes]:
     """Read the finished fits of a folder as bytes, by relative path."""
     fits = folder / "fits"
     return {path.relative_to(fits).as_posix(): path.read_bytes() for path in sorted(fits.rglob("*.safetensors"))}
 
 
-def timed_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float:
+def time_fits(shapes: list[Path], folder: Path, model: str, jobs: int) -> float:
     """Run `meshmatch fit` from scratch in a new process and return its seconds; `InputError` if it fails."""
     words = [*map(str, shapes), "-o", str(folder), "--model", model, "--jobs", str(jobs), "--quiet", "--json"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
@@ -102,7 +102,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
         bench = load_set(name, data)
         paths = [bench.path(each) for each in runner.evenly_spread(list(bench.shapes), limit)]
     one, two = work / f"{name}-1", work / f"{name}-2"
-    seconds = {folder: timed_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
+    seconds = {folder: time_fits(paths, folder, model, number) for folder, number in ((one, 1), (two, 2))}
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6  # maximum over all child processes so far
     collection = Collection(two, 2)
     pairs = list(permutations(collection.names, 2))
@@ -122,7 +122,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
         error, unit = float(np.mean(list(scores.means_cm.values()))), "cm"
     return {
         **{"set": name, "shapes": len(paths), "maps": len(pairs), "one_s": seconds[one], "two_s": seconds[two]},
-        **{"gain": seconds[one] / seconds[two], "same": contents(one) == contents(two), "largest_gb": largest},
+        **{"gain": seconds[one] / seconds[two], "same": read_fits(one) == read_fits(two), "largest_gb": largest},
         **{"maps_s": written, "map_ms": 1000 * each, "error": error, "unit": unit, "details": details},
     }
 
@@ -130,7 +130,7 @@ def measure(name: str, data: Path, work: Path, limit: int | None, model: str | N
 def heart_pairs(data: Path, limit: int) -> dict[str, Any]:
     """Compute the errors of hearts that are matched pair by pair, without a model."""
     shapes, truth = load_folder(data / HEART, TRUTH)
-    found = matched_directly(Matcher(NO_MODEL, threads=1), shapes, ordered_pairs(shapes, limit), HEART)
+    found = match_directly(Matcher(NO_MODEL, threads=1), shapes, ordered_pairs(shapes, limit), HEART)
     return {"how": "of pairs", **heart_errors(shapes, truth, {pair: each.map for pair, each in found.items()})}
 
 

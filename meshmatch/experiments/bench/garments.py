@@ -78,7 +78,7 @@ class Bound:
         known = tuple((int(a), int(b), float(size)) for _, a, b, size in scales)
         return cls(mesh, corners, table[:, 3:6], table[:, 6:], known)
 
-    def on(self, base: Floats) -> Shape:
+    def refit(self, base: Floats) -> Shape:
         """Refit the garment to a base mesh (V, 3) at rest, in meters."""
         axes = enumerate(
             self.scales
@@ -86,11 +86,11 @@ class Bound:
         stretch = np.array([abs(base[a, k] - base[b, k]) / size for k, (a, b, size) in axes])
         return self._with(np.einsum("nk,nkd->nd", self.weights, base[self.corners]) + self.offsets * stretch)
 
-    def posed(self, base: Floats, moves: Floats) -> Shape:
+    def refit_posed(self, base: Floats, moves: Floats) -> Shape:
         """Refit to a base mesh at rest, then pose the garment by the affine maps (V, 3, 4) of the base mesh's vertices."""
         share = np.maximum(self.weights, 0.0)
         own = np.einsum("nk,nkij->nij", share / share.sum(axis=1, keepdims=True), moves[self.corners])
-        return self._with(np.einsum("nij,nj->ni", own[:, :, :3], self.on(base).verts) + own[:, :, 3])
+        return self._with(np.einsum("nij,nj->ni", own[:, :, :3], self.refit(base).verts) + own[:, :, 3])
 
     def _with(self, verts: Floats) -> Shape:
         return Shape(verts, self.mesh.faces, self.mesh.name)
@@ -104,11 +104,11 @@ class Person:
     posed: Floats
     moves: Floats
 
-    def wears(self, garment: Bound, pose: Pose) -> Shape:
-        return garment.on(self.rest) if pose == "rest" else garment.posed(self.rest, self.moves)
+    def worn_shape(self, garment: Bound, pose: Pose) -> Shape:
+        return garment.refit(self.rest) if pose == "rest" else garment.refit_posed(self.rest, self.moves)
 
 
-def people(count: int, seed: int) -> tuple[list[Person], Ints]:
+def generate_people(count: int, seed: int) -> tuple[list[Person], Ints]:
     """Generate people; return them and the triangles of their bodies."""
     rig = build_rig(count, seed, keep=np.arange(_BASE_VERTICES), topology=_TOPOLOGY, dtype=torch.float32)
     world, offset = sample_free_pose(rig, rig.heads, torch.Generator().manual_seed(seed))
@@ -127,11 +127,11 @@ def body_of(base: Floats, faces: Ints, name: str, cut: bool) -> Shape:
     return decimate(Shape(weights @ body, fine, name), _TARGET_FACES)
 
 
-def measured(
+def measure_garment(
     garment: Bound, source: Person, target: Person, pose: Pose, found: VertexMap, bodies: tuple[Shape, Shape]
 ) -> Any:
     """Transfer a garment; return distances from the exact refit, in centimeters, and masks of vertices under the skin."""
-    worn, true = source.wears(garment, "rest"), target.wears(garment, pose)
+    worn, true = source.worn_shape(garment, "rest"), target.worn_shape(garment, pose)
     carried = carry_garment(worn, found, *bodies)
     out = ~inside(bodies[0], worn.verts)
     return {
@@ -159,7 +159,7 @@ def rows_of(
 
     Without a matcher, garments are transferred by the true map.
     """
-    crowd, faces = people(count, seed)
+    crowd, faces = generate_people(count, seed)
     found: dict[str, list[Any]] = {name: [] for name in garments}
     for k in runner.track(range(count), pose):
         source, target = crowd[k], crowd[(k + 1) % count]
@@ -168,7 +168,7 @@ def rows_of(
         exact = true_map(bodies[0], there[: bodies[0].V], bodies[1])
         way = exact if matcher is None else matcher.match(*bodies).map
         for name, garment in garments.items():
-            found[name].append(measured(garment, source, target, pose, way, bodies))
+            found[name].append(measure_garment(garment, source, target, pose, way, bodies))
     rows = [_row(name, pose, each) for name, each in found.items()]
     return [*rows, _row("all", pose, [each for several in found.values() for each in several])]
 

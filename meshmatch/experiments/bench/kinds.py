@@ -27,7 +27,7 @@ from typer import Option
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Ints
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.pairs import matched, matched_directly
+from meshmatch.experiments.bench.pairs import match_by_fits, match_directly
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import Pair, Shapes, load_folder, ordered_pairs
 from meshmatch.experiments.makers.cut_scans import make_scans, scan_errors
@@ -133,7 +133,7 @@ def cut_scans(kind: str, count: int, seed: int, cache: Path | None) -> Subjects:
     )
 
 
-def measured(
+def measure_set(
     name: str, subjects: Subjects, matcher: Matcher, limit: int | None = None, direct: bool = False
 ) -> tuple[dict[str, Any], list[Table]]:
     """Measure all pairs of a set, or ``limit`` of them; ``direct`` matches without a model.
@@ -142,9 +142,9 @@ def measured(
     """
     pairs, fits = ordered_pairs(subjects.shapes, limit), dict[str, Fit]()
     if direct:
-        found = matched_directly(matcher, subjects.shapes, pairs, name)
+        found = match_directly(matcher, subjects.shapes, pairs, name)
     else:
-        fits, found = matched(matcher, subjects.shapes, pairs, name)
+        fits, found = match_by_fits(matcher, subjects.shapes, pairs, name)
     errors = subjects.errors({pair: each.map for pair, each in found.items()})
     whole = rows_of(errors, lambda _: "all")[0]
     groups = {"verdict": lambda pair: found[pair].verdict, **subjects.groups}
@@ -180,6 +180,6 @@ def main(
     for name in runner.split_names(sets, SETS, "set"):
         matcher = Matcher(model or MODELS.get(name, name), FitConfig(seed=seed), threads)
         subjects = animals(data, limit_shapes, cache) if name == "animals" else cut_scans(name, scans, seed, cache)
-        record[name], some = measured(name, subjects, matcher, limit_pairs, model == NO_MODEL)
+        record[name], some = measure_set(name, subjects, matcher, limit_pairs, model == NO_MODEL)
         tables += some
     return runner.Report(record, tables)

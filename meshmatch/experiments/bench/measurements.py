@@ -42,8 +42,10 @@ def people_of(name: str, shapes: Iterable[str]) -> dict[str, list[str]]:
     return found
 
 
-def measured(bench: BenchSet, shapes: list[str], matcher: meshmatch.Matcher, body: meshmatch.Fit) -> list[list[Floats]]:
-    """Measure each shape; (2, N): by `measure`, and by the true correspondences from the first shape."""
+def measure_person(
+    bench: BenchSet, shapes: list[str], matcher: meshmatch.Matcher, body: meshmatch.Fit
+) -> list[list[Floats]]:
+    """Measure each shape of a person; (2, N): by `measure`, and by true correspondences from the first shape."""
     points, found = measuring_points(BODY), []
     first = bench.shape(shapes[0])
     places = None
@@ -111,7 +113,7 @@ def main(
     for name in runner.split_names(sets, ("faust", "scape"), "set"):
         bench = load_set(name, data)
         people = [
-            np.array(measured(bench, runner.evenly_spread(own, limit_shapes), matcher, body))
+            np.array(measure_person(bench, runner.evenly_spread(own, limit_shapes), matcher, body))
             for own in people_of(name, bench.shapes).values()
         ]
         for each in dict.fromkeys(map(_without_side, names)):

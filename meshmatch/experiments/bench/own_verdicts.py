@@ -29,7 +29,7 @@ from meshmatch.collections.collection import Collection
 from meshmatch.collections.compare import Compared
 from meshmatch.collections.setting import SINGLE_FITS, SUFFIX, Record
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.specimens import SETS, SIDED, Specimens, collected, scanned, wholes
+from meshmatch.experiments.bench.specimens import SETS, SIDED, Specimens, by_collection, make_scan, registered_shapes
 from meshmatch.experiments.makers.molars_and_leaves import MAKERS, deform_randomly
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.reference_statistics import Weights
@@ -55,12 +55,12 @@ class Spoiled:
     how: Mapping[str, str]
 
 
-def spoiled(name: str, data: Path, count: int, seed: int) -> Spoiled:
+def make_spoiled(name: str, data: Path, count: int, seed: int) -> Spoiled:
     """Make a collection of ``count`` specimens, or fewer if it has fewer."""
     rng = np.random.default_rng([seed, 30, SETS.index(name)])
     shapes, others = (
-        wholes(name, data, count, seed + 1),
-        list(wholes(REPLACEMENTS[name], data, count, seed + 1).values()),
+        registered_shapes(name, data, count, seed + 1),
+        list(registered_shapes(REPLACEMENTS[name], data, count, seed + 1).values()),
     )
     made, how = {}, {}
     for number, (key, whole) in enumerate(shapes.items()):
@@ -72,19 +72,19 @@ def spoiled(name: str, data: Path, count: int, seed: int) -> Spoiled:
         if what == "replaced":
             other = others[number % len(others)]
             whole = Shape(other.verts * unit / np.sqrt(other.area), other.faces, whole.name)
-        one = scanned(whole, rng, name in SIDED and number % 3 == 2, what == "cut")
+        one = make_scan(whole, rng, name in SIDED and number % 3 == 2, what == "cut")
         made[key], how[key] = one, what
     return Spoiled(Specimens(made, "mm"), how)
 
 
 def measure(name: str, data: Path, count: int, seed: int, work: Path) -> dict[str, Any]:
     """Fit a collection; return name, treatment, error and verdict of each fit."""
-    found = spoiled(name, data, count, seed)
+    found = make_spoiled(name, data, count, seed)
     scans, fits = work / "scans" / name, work / "fits" / name
     make_folder(scans)
     for key, each in found.some.each.items():
         save_shape(scans / f"{key}.ply", each.shape)
-    done = collected(found.some, scans, fits, NO_MODEL)
+    done = by_collection(found.some, scans, fits, NO_MODEL)
     sound = {key for key, what in found.how.items() if what == "sound"}
     apart: dict[str, list[float]] = {key: [] for key in found.how}
     for pair in permutations([key for key, what in found.how.items() if what != "replaced"], 2):
@@ -130,7 +130,7 @@ class SingleFits:
         return np.array(values).reshape(-1, 2), np.array([is_right(row) for row in some], bool)
 
 
-def fitted_weights(values: Float[Floats, "N 2"], right: Bool[Bools, " N"], ridge: float = 0.002) -> Weights:
+def fit_weights(values: Float[Floats, "N 2"], right: Bool[Bools, " N"], ridge: float = 0.002) -> Weights:
     """Fit weights by ridge-regularized logistic regression; larger features never improve a verdict."""
     deviation = values.std(0) + 1e-9
 
@@ -150,10 +150,10 @@ def is_right(row: Mapping[str, Any]) -> bool:
 def row_of(name: str, weights: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Count the verdicts of right and of lost fits."""
     right = [is_right(each) for each in rows]
-    told = [each["verdict"] for each in rows]
-    both = list(zip(right, told, strict=True))
+    verdicts = [each["verdict"] for each in rows]
+    both = list(zip(right, verdicts, strict=True))
     return {
-        **{"name": name, "weights": weights, "fits": len(rows), "right": sum(right), "good": told.count("good")},
+        **{"name": name, "weights": weights, "fits": len(rows), "right": sum(right), "good": verdicts.count("good")},
         "good_lost": sum(not known and verdict == "good" for known, verdict in both),
         "believed": sum(known and verdict in ("good", "fair") for known, verdict in both),
         "lost_not_poor": sum(not known and verdict in ("good", "fair") for known, verdict in both),
@@ -183,7 +183,7 @@ def main(
 
     def weights_without(name: str) -> Weights:
         values, right = zip(*(each for other, each in signs.items() if other != name), strict=True)
-        return fitted_weights(np.concatenate(values), np.concatenate(right))
+        return fit_weights(np.concatenate(values), np.concatenate(right))
 
     rows, held = [], []
     for name in names:

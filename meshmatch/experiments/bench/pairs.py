@@ -16,7 +16,7 @@ VERDICTS = ("good", "fair", "poor")
 
 
 @dataclass(frozen=True, eq=False)
-class Matched:
+class MatchedPair:
     """The map of a pair, the worse verdict of its fits, and the CPU seconds of fits and map."""
 
     map: VertexMap
@@ -24,9 +24,9 @@ class Matched:
     seconds: float
 
 
-def matched(
+def match_by_fits(
     matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str
-) -> tuple[dict[str, Fit], dict[Pair, Matched]]:
+) -> tuple[dict[str, Fit], dict[Pair, MatchedPair]]:
     """Fit all shapes and map all pairs; return fits by name and maps by pair."""
     fits, spent = {}, {}
     for name, shape in track(shapes.items(), f"{what}: fitting", len(shapes)):
@@ -38,15 +38,15 @@ def matched(
         began = time.process_time()
         vertex_map = matcher.map(fits[a], fits[b])
         seconds = spent[a] + spent[b] + time.process_time() - began
-        found[a, b] = Matched(vertex_map, max(fits[a].verdict, fits[b].verdict, key=VERDICTS.index), seconds)
+        found[a, b] = MatchedPair(vertex_map, max(fits[a].verdict, fits[b].verdict, key=VERDICTS.index), seconds)
     return fits, found
 
 
-def matched_directly(matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str) -> dict[Pair, Matched]:
+def match_directly(matcher: Matcher, shapes: Shapes, pairs: Sequence[Pair], what: str) -> dict[Pair, MatchedPair]:
     """Match all pairs without a model; return maps by pair."""
     found = {}
     for a, b in track(pairs, what, len(pairs)):
         began = time.process_time()
         vertex_map = matcher.match(shapes[a], shapes[b]).map
-        found[a, b] = Matched(vertex_map, str(vertex_map.verdict), time.process_time() - began)
+        found[a, b] = MatchedPair(vertex_map, str(vertex_map.verdict), time.process_time() - began)
     return found

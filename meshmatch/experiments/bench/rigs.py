@@ -34,7 +34,13 @@ from meshmatch.arrays import Floats
 from meshmatch.experiments import runner
 from meshmatch.experiments.bench.pairs import VERDICTS
 from meshmatch.experiments.bench.sets import ordered_pairs
-from meshmatch.experiments.bench.skinning import from_bones, in_motion, nearest_and_inpainted, skinned, volume
+from meshmatch.experiments.bench.skinning import (
+    distances_from_bones,
+    nearest_and_inpainted,
+    pose_in_motion,
+    skin_vertices,
+    volume,
+)
 from meshmatch.shapes.formats.gltf_rig import Rig, read_rig
 from meshmatch.shapes.input_files import read_bytes
 from meshmatch.shapes.shape import Shape
@@ -116,7 +122,7 @@ def _distance_from_segment(place: Floats, begin: Floats, end: Floats) -> float:
     return float(np.linalg.norm(begin + share * along - place))
 
 
-def measured(source: _Character, target: _Character, matcher: Matcher) -> dict[str, Any]:
+def measure_pair(source: _Character, target: _Character, matcher: Matcher) -> dict[str, Any]:
     """Transfer the rig of one pair and measure it."""
     began = time.process_time()
     made = meshmatch.transfer_rig(source.path, target.path, matcher)
@@ -161,9 +167,9 @@ def _main_joints(character: _Character, weights: SkinWeights, shared: set[str]) 
 
 def _measure_motion(shape: Shape, weights: SkinWeights, rig: Rig, unit: float) -> tuple[float, float]:
     """Pose a shape; return the ratio of volumes, and the share of vertices that move away from their bones."""
-    posed, main = in_motion(rig), most_votes(weights.matrix)
-    verts = skinned(shape.verts, weights.matrix, rig, posed)
-    away = from_bones(verts, main, posed) - from_bones(shape.verts, main, rig)
+    posed, main = pose_in_motion(rig), most_votes(weights.matrix)
+    verts = skin_vertices(shape.verts, weights.matrix, rig, posed)
+    away = distances_from_bones(verts, main, posed) - distances_from_bones(shape.verts, main, rig)
     return volume(verts, shape) / volume(shape.verts, shape), float((unit * away > _MAX_DRIFT_CM).mean())
 
 
@@ -207,7 +213,9 @@ def main(
         characters, matcher = {file.stem: _Character(file) for file in files}, Matcher(threads=threads)
         pairs = runner.evenly_spread(ordered_pairs(characters), limit_pairs)
         each[folder] = [
-            runner.cached_in(work, f"{folder}-{a}-{b}", {}, partial(measured, characters[a], characters[b], matcher))
+            runner.cached_in(
+                work, f"{folder}-{a}-{b}", {}, partial(measure_pair, characters[a], characters[b], matcher)
+            )
             for a, b in runner.track(pairs, folder)
         ]
         rows.append(row_of(folder, each[folder]))

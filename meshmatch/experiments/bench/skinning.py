@@ -30,7 +30,7 @@ _MOTION_CLIPS = ("run", "gallop", "swim")
 _SITTING = (("upperleg", -90.0), ("thigh", -90.0), ("lowerleg", 90.0), ("calf", 90.0))
 
 
-def in_motion(rig: Rig) -> Rig:
+def pose_in_motion(rig: Rig) -> Rig:
     """Pose a skeleton in the middle of its first clip of running or swimming, or else sitting; y is up, x lateral."""
     found = [clip for clip in rig.clips if any(word in clip.name.lower() for word in _MOTION_CLIPS)]
     rotations, translations, scales = rig.rotations.copy(), rig.translations.copy(), rig.scales.copy()
@@ -56,7 +56,7 @@ def _turns(rig: Rig) -> Float[Floats, "N 3 3"]:
     return np.asarray(matrices / np.linalg.norm(matrices, axis=1, keepdims=True))
 
 
-def skinned(verts: Float[Floats, "V 3"], weights: csr_array, bind: Rig, posed: Rig) -> Float[Floats, "V 3"]:
+def skin_vertices(verts: Float[Floats, "V 3"], weights: csr_array, bind: Rig, posed: Rig) -> Float[Floats, "V 3"]:
     """Move vertices from the pose of `bind` to that of `posed` by linear blend skinning."""
     moves = (posed.worlds() @ np.linalg.inv(bind.worlds()))[bind.joints]
     blended = (weights @ moves.reshape(len(moves), 16)).reshape(-1, 4, 4)
@@ -69,7 +69,7 @@ def volume(verts: Float[Floats, "V 3"], shape: Shape) -> float:
     return float(dot(corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 
 
-def from_bones(verts: Float[Floats, "V 3"], main: Int[Ints, " V"], rig: Rig) -> Float[Floats, " V"]:
+def distances_from_bones(verts: Float[Floats, "V 3"], main: Int[Ints, " V"], rig: Rig) -> Float[Floats, " V"]:
     """Compute distances (V,) of vertices from the bones of their joints, which run to each joint's children."""
     places, nodes = rig.worlds()[:, :3, 3], rig.joints[main]
     away = np.linalg.norm(verts - places[nodes], axis=1)
@@ -110,10 +110,12 @@ def nearest_and_inpainted(
     size = np.linalg.norm(normals, axis=1) * np.linalg.norm(there, axis=1)
     alike = dot(normals, there) > np.cos(np.radians(_MAX_ANGLE)) * np.maximum(size, 1e-300)
     known = alike & (foot.distance < _MAX_DISTANCE * np.linalg.norm(np.ptp(target.bounds, axis=0)))
-    return largest_weights(nearest, influences), largest_weights(_inpainted(target, twin, known, nearest), influences)
+    return largest_weights(nearest, influences), largest_weights(
+        _inpaint_weights(target, twin, known, nearest), influences
+    )
 
 
-def _inpainted(target: Shape, twin: Ints, known: Bools, values: csr_array) -> csr_array:
+def _inpaint_weights(target: Shape, twin: Ints, known: Bools, values: csr_array) -> csr_array:
     """Keep known weights and solve for the others by minimizing the bi-Laplacian energy."""
     first, place = np.unique(twin, return_inverse=True)
     faces = place[target.faces]

@@ -88,7 +88,7 @@ class Specimen:
     mirrored: bool = False
     cut: bool = False
 
-    def seen_on(self, other: Specimen) -> Float[Floats, "N 3"]:
+    def true_points_on(self, other: Specimen) -> Float[Floats, "N 3"]:
         """Return the true positions of its known vertices on another specimen; nan where that lacks them."""
         return interpolate(other.places, self.corners, self.weights)
 
@@ -105,7 +105,7 @@ class Specimens:
         """Compute errors, in the unit, of the mapped points of the source's known vertices; nan without a true point."""
         source, target = (self.each[name] for name in pair)
         if self.folder is None:
-            return np.asarray(np.linalg.norm(points - source.seen_on(target), axis=1))
+            return np.asarray(np.linalg.norm(points - source.true_points_on(target), axis=1))
         at = cKDTree(target.shape.verts).query(points)[1]
         known = any_shapes.distances(self.folder, pair[1])
         ways = [100 * known[way, at] for way in any_shapes.symmetries(self.folder, *pair)]
@@ -127,7 +127,7 @@ def moved(shape: Shape, frame: Frame) -> Shape:
     return Shape(frame.apply(shape.verts), shape.faces[:, ::-1] if frame.mirrored else shape.faces, shape.name)
 
 
-def scanned(whole: Shape, rng: np.random.Generator, mirror: bool, cut: bool) -> Specimen:
+def make_scan(whole: Shape, rng: np.random.Generator, mirror: bool, cut: bool) -> Specimen:
     """Make a specimen from a shape in correspondence: remeshed, moved at random, and without one end if ``cut``."""
     shape, places = decimate(whole, int(whole.F * rng.uniform(0.5, 0.8))), np.array(whole.verts)
     if cut:
@@ -160,7 +160,7 @@ def by_points(
     )
 
 
-def wholes(name: str, data: Path, count: int, seed: int) -> dict[str, Shape]:
+def registered_shapes(name: str, data: Path, count: int, seed: int) -> dict[str, Shape]:
     """Return the shapes of a set in correspondence: femurs from files, others generated."""
     if name == "femurs":
         files = runner.evenly_spread(runner.files_in(data / "femur", "*.ply"), count)
@@ -192,10 +192,10 @@ def load(name: str, data: Path, count: int, seed: int) -> Specimens:
             at[truth[each][:, 0]] = np.arange(len(truth[each]))
             made[each] = by_points(shapes_of[each], at, size, rng, mirrored[number])
         return Specimens(made, "mm")
-    shapes = wholes(name, data, count, seed)
+    shapes = registered_shapes(name, data, count, seed)
     cut = [name == "femurs" and k >= len(shapes) - _N_CUT for k in range(len(shapes))]
     each_how = zip(shapes.items(), mirrored, cut, strict=False)
-    return Specimens({key: scanned(shape, rng, *how) for (key, shape), *how in each_how}, "mm")
+    return Specimens({key: make_scan(shape, rng, *how) for (key, shape), *how in each_how}, "mm")
 
 
 Points = Callable[[Pair], Floats]
@@ -211,7 +211,7 @@ class Done:
     pairs: list[tuple[str, bool]] = field(default_factory=list)
 
 
-def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Done:
+def by_collection(some: Specimens, scans: Path, work: Path, model: str | Path) -> Done:
     """Fit a collection by ``meshmatch fit SCANS -o FITS --model MODEL``."""
     collection = Collection(work, workers=1)
     records = collection.fit(scans, model=model).records
@@ -225,12 +225,12 @@ def collected(some: Specimens, scans: Path, work: Path, model: str | Path) -> Do
     return Done(points, records)
 
 
-def own(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
+def by_own_model(some: Specimens, scans: Path, work: Path, steps: int) -> Done:
     """Train a model on the specimens and fit them with it."""
     prepare(scans, work / "prepared", PrepareConfig(NodeConfig("geodesic", grow=True)))
     recipe = recipe_for(work / "prepared").changed(steps=steps)
     train(work / "model", shapes=work / "prepared", recipe=recipe)
-    return collected(some, scans, work / "fits", work / "model")
+    return by_collection(some, scans, work / "fits", work / "model")
 
 
 def by_pairs(some: Specimens, scans: Path, work: Path) -> Done:
@@ -318,8 +318,8 @@ def measure(
     assert max(float(np.abs(off).max()) for off in exact.values()) < 1e-3
     began = _cpu_seconds()
     ways: dict[str, Callable[[Specimens, Path, Path], Done]] = {
-        NO_MODEL: partial(collected, model=NO_MODEL),
-        "own": partial(own, steps=steps),
+        NO_MODEL: partial(by_collection, model=NO_MODEL),
+        "own": partial(by_own_model, steps=steps),
         PAIRS: by_pairs,
         "meshmonk": by_meshmonk,
     }
@@ -344,8 +344,8 @@ def measure(
         counts = Counter([each.verdict for each in done.records] or [verdict for verdict, _ in done.pairs])
         row |= {"sides": sides_found(some, done), **{each: counts[each] for each in VERDICTS[:3]}}
     of_each = {each: [means[pair] for pair in means if each in pair] for each in some.each}
-    told = {each.name: [each.verdict, each.trust, each.reasons] for each in done.records}
-    return row | {"each": {key: [float(np.mean(off)), *told.get(key, [])] for key, off in of_each.items()}}
+    verdicts = {each.name: [each.verdict, each.trust, each.reasons] for each in done.records}
+    return row | {"each": {key: [float(np.mean(off)), *verdicts.get(key, [])] for key, off in of_each.items()}}
 
 
 @runner.command

@@ -133,7 +133,7 @@ def split(shape: Shape) -> Shape:
     return Shape(np.concatenate([shape.verts, middles]), faces, shape.name)
 
 
-def sized(shape: Shape, V: int) -> Shape:
+def resize(shape: Shape, V: int) -> Shape:
     """Split a closed shape until it has at least V vertices; below 200,000 vertices it is then decimated to about V."""
     while shape.V < V:
         shape = split(shape)
@@ -184,7 +184,7 @@ def _write(word: str, path: Path, made: list[Path]) -> None:
     else:
         size, _, change = word.partition("+")
         sample, V = size.split("@")
-        shape = sized(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), int(V))
+        shape = resize(load_shape(bundled_folder() / "samples" / f"{sample}.ply"), int(V))
         save_shape(path, CHANGES[change](shape))
 
 
@@ -252,7 +252,7 @@ BEFORE_COLUMNS = {"s before": "wall_before:.2f", "CPU s before": "cpu_before:.2f
 RATIO_COLUMNS = {"s, ratio": "wall_ratio:.2f", "CPU, ratio": "cpu_ratio:.2f", "GB, ratio": "gigabytes_ratio:.2f"}
 
 
-def earlier(path: Path) -> dict[str, dict[str, Any]]:
+def read_earlier(path: Path) -> dict[str, dict[str, Any]]:
     """Read the rows of an earlier run by case name; `InputError` if the file does not contain one."""
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))["values"]["cases"]
@@ -261,7 +261,7 @@ def earlier(path: Path) -> dict[str, dict[str, Any]]:
         raise InputError(f"{path} holds no run of this experiment", "give a file that --save wrote") from error
 
 
-def compared(row: dict[str, Any], before: dict[str, float]) -> dict[str, Any]:
+def add_comparison(row: dict[str, Any], before: dict[str, float]) -> dict[str, Any]:
     """Add the numbers of an earlier row to a row, and the ratios to them."""
     return (
         row
@@ -277,11 +277,11 @@ def main(
     cores: Annotated[int, Option(min=1, help="cores that all processes share")] = 2,
     against: Annotated[Path | None, Option(help="saved results of an earlier run to compare with")] = None,
 ) -> runner.Report:
-    before = {} if against is None else earlier(against)
+    before = {} if against is None else read_earlier(against)
     kept = keep_to_cores(cores)
     with tempfile.TemporaryDirectory() as folder:
         rows = [
-            compared(record_of(name, CASES[name], measure(CASES[name], runs, Path(folder))), before.get(name, {}))
+            add_comparison(record_of(name, CASES[name], measure(CASES[name], runs, Path(folder))), before.get(name, {}))
             for name in runner.track(runner.split_names(cases, CASES, "case"), "running")
         ]
     title = f"Whole processes on {kept} cores, median of {runs} runs"

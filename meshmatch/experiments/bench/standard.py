@@ -33,7 +33,7 @@ from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.pairs import matched, matched_directly
+from meshmatch.experiments.bench.pairs import match_by_fits, match_directly
 from meshmatch.experiments.bench.scores import TruthDistances
 from meshmatch.experiments.bench.sets import Pair, Shapes
 from meshmatch.fitting.fit_config import FitConfig
@@ -83,11 +83,11 @@ class Split:
     reference: str = ""
     partners: Mapping[Pair, Int[Ints, " V"]] = field(default_factory=dict)
 
-    def asked(self, pair: Pair) -> Int[Ints, " N"]:
-        """Return the source's vertices whose true partners are ``known(target)``, in the same order."""
+    def source_points(self, pair: Pair) -> Int[Ints, " N"]:
+        """Return the source's vertices whose true partners are ``target_points(target)``, in the same order."""
         return self.partners[pair] if self.partners else self.points[pair[0]]
 
-    def known(self, target: str) -> Int[Ints, " N"]:
+    def target_points(self, target: str) -> Int[Ints, " N"]:
         """Return the vertices of a target that are true partners."""
         everywhere = self.partners or target == self.reference
         return np.arange(self.shapes[target].V) if everywhere else self.points[target]
@@ -198,9 +198,9 @@ def errors_of(split: Split, indices: Mapping[Pair, Int[Ints, " V"]], cache: Path
     found: dict[Pair, Floats] = {}
     for target in runner.track(sorted({pair[1] for pair in indices}), "measuring"):
         mine = [pair for pair in indices if pair[1] == target]
-        distances = TruthDistances(split.shapes[target], split.known(target), cache)
+        distances = TruthDistances(split.shapes[target], split.target_points(target), cache)
         if target != split.reference:
-            at = distances.errors([indices[pair][split.asked(pair)] for pair in mine])
+            at = distances.errors([indices[pair][split.source_points(pair)] for pair in mine])
             found |= {pair: 100 * each.astype(np.float64) for pair, each in zip(mine, at, strict=True)}
             continue
         for pair in mine:
@@ -260,12 +260,12 @@ def main(
         runner.log(f"{name}: {len(split.shapes)} shapes, {len(pairs)} pairs")
         matcher = Matcher(chosen, FitConfig(seed=seed), threads)
         if chosen == NO_MODEL:
-            found = matched_directly(matcher, split.shapes, pairs, name)
+            found = match_directly(matcher, split.shapes, pairs, name)
         else:
             used = {each for pair in pairs for each in pair}
-            found = matched(matcher, {each: split.shapes[each] for each in split.shapes if each in used}, pairs, name)[
-                1
-            ]
+            found = match_by_fits(
+                matcher, {each: split.shapes[each] for each in split.shapes if each in used}, pairs, name
+            )[1]
         errors = errors_of(split, {pair: each.map.index for pair, each in found.items()}, cache)
         cpu = float(np.mean([each.seconds for each in found.values()]))
         rows.append(row_of(name, chosen, split, errors, cpu) | {"minutes": (time.perf_counter() - began) / 60})

@@ -47,7 +47,7 @@ def colors_at(path: Path, points: Float[Floats, "N 3"]) -> Float[Floats, "N 3"]:
     return np.asarray(to_srgb(found[:3].T))
 
 
-def measured(source: Path, target: Path, options: meshmatch.BakeOptions, folder: Path) -> dict[str, Any]:
+def measure_target(source: Path, target: Path, options: meshmatch.BakeOptions, folder: Path) -> dict[str, Any]:
     """Transfer a texture there and back; return its PSNR, and the flipped and crushed shares of the target's map."""
     began = time.process_time()
     there, back = folder / "there.glb", folder / "back.glb"
@@ -86,5 +86,5 @@ def main(
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name in runner.track(targets.split(","), "carrying"):
-            rows.append(measured(samples / SOURCE, samples / name, options, Path(folder)))
+            rows.append(measure_target(samples / SOURCE, samples / name, options, Path(folder)))
     return runner.Report({"rows": rows}, [runner.table(f"Textures of {size} there and back", rows, COLUMNS)])

@@ -14,7 +14,7 @@ from typer import Option
 
 from meshmatch.api.wrap import wrap
 from meshmatch.experiments import runner
-from meshmatch.experiments.bench.garments import Bound, Pose, body_of, people
+from meshmatch.experiments.bench.garments import Bound, Pose, body_of, generate_people
 from meshmatch.maps.mapped_mesh import MappedMesh
 
 COLUMNS = {
@@ -43,16 +43,16 @@ def main(
     seed: runner.Seed = 0,
 ) -> runner.Report:
     files = runner.files_in(data / "topologies", "*.proxy")
-    crowd, faces = people(count, seed)
+    crowd, faces = generate_people(count, seed)
     rows = []
     for pose in runner.split_names(poses, get_args(Pose), "pose"):
         for file in files:
             bound, found = Bound.read(file), []
             for k in runner.track(range(count), f"{file.stem}, {pose}"):
                 source, target = crowd[k], crowd[(k + 1) % count]
-                truth = target.wears(bound, "rest" if pose == "rest" else "posed").verts
+                truth = target.worn_shape(bound, "rest" if pose == "rest" else "posed").verts
                 scan = body_of(target.rest if pose == "rest" else target.posed, faces, f"person {k}", cut=True)
-                wrapped = wrap(source.wears(bound, "rest"), scan, model=model, threads=threads)
+                wrapped = wrap(source.worn_shape(bound, "rest"), scan, model=model, threads=threads)
                 away = np.linalg.norm(wrapped.shape.verts - truth, axis=1)
                 found.append(100 * np.stack([away, wrapped.distance, MappedMesh.of(scan).query(truth).distance]))
             rows.append(_row(file.stem, pose, np.concatenate(found, axis=1), count))

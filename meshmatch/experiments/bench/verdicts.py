@@ -92,7 +92,7 @@ def target_of(others: Cases, matcher: Matcher, number: int) -> Target:
             return Target(shape, matcher.fit(shape), places, has)
 
 
-def measured(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
+def measure_case(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
     """Match a case to a target; return its verdict, error, features and confidence bins."""
     began = time.process_time()
     row: dict[str, Any] = {"family": case.family, "verdict": REFUSED, "error": float("inf")}
@@ -184,7 +184,7 @@ def bars_of(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def fitted_weights(
+def fit_weights(
     found: Sequence[Mapping[str, Any]], near: Calibration | None = None
 ) -> tuple[Float[Floats, " N"], float]:
     """Fit weights of the features and an offset by logistic regression of being wrong.
@@ -221,7 +221,7 @@ def measure_seed(
     def family(name: str) -> dict[str, Any]:
         first = list(FAMILIES).index(name) * count
         numbers = runner.track(range(count), f"{name}, seed {seed}", count)
-        return {"found": [measured(cases.draw(name, k), onto((first + k) % _N_TARGETS), matcher) for k in numbers]}
+        return {"found": [measure_case(cases.draw(name, k), onto((first + k) % _N_TARGETS), matcher) for k in numbers]}
 
     for name in names:
         which = {"kind": kind, "family": name, "count": count, "seed": seed, "targets": _N_TARGETS}
@@ -283,7 +283,7 @@ def main(
     record: dict[str, Any] = {"families": by_family, "verdicts": by_verdict, "confidence": steps, "auc": auc, **bars}
     if fit:
         near = None if kind == "human" else CALIBRATION
-        weights, offset = fitted_weights([each for each in found if each["family"] not in KEPT], near)
+        weights, offset = fit_weights([each for each in found if each["family"] not in KEPT], near)
         record["weights"] = [round(float(value), 3) for value in weights] + [round(offset, 3)]
         fitted = Calibration(
             weights=tuple(record["weights"][:-1]),
