@@ -64,13 +64,7 @@ _POSE_COLUMNS = {
 _POSE_COLUMNS |= {"of these not poor": "not_poor:d"}
 _N_IDENTITIES, _FIRST_IDENTITY_SEED = 64, 5300
 _TRIES = 6  # poses drawn for each body; the one with the least self-penetration is used
-_STYLE_PROBABILITIES = (
-    0.78,
-    0.12,
-    0.06,
-    0.04,
-    0.0,
-)  # probabilities of plain, child, stretched, stylized, built of parts
+_STYLE_PROBABILITIES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, stretched, stylized, built of parts
 # Mean angles in degrees, in the order of the fields of `Limbs`: alternatives for an arm (elevation, azimuth, twist, elbow,
 # pronation), alternatives for a leg (hip flexion, abduction, twist, knee, ankle), and the spine (flexion, side, twist).
 _HANG, _AHEAD, _UP = (12, 10, 0, 8, 10), (85, 88, 0, 15, 10), (172, 40, -60, 8, 0)

@@ -80,9 +80,7 @@ class Bound:
 
     def refit(self, base: Floats) -> Shape:
         """Refit the garment to a base mesh (V, 3) at rest, in meters."""
-        axes = enumerate(
-            self.scales
-        )  # offsets and sizes are in decimeters, so that the result is in the unit of the base mesh
+        axes = enumerate(self.scales)  # offsets and sizes are in decimeters: the result has the unit of the base mesh
         stretch = np.array([abs(base[a, k] - base[b, k]) / size for k, (a, b, size) in axes])
         return self._with(np.einsum("nk,nkd->nd", self.weights, base[self.corners]) + self.offsets * stretch)
 

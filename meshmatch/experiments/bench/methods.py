@@ -305,9 +305,8 @@ class ZoomOut:
         need_meshes("ZoomOut", shape)
         whole = in_frame(shape, sqrt_area_frame(shape))
         thin = decimate(whole, self.faces)
-        used, faces = np.unique(
-            thin.faces, return_inverse=True
-        )  # an unreferenced vertex makes the mass matrix singular
+        # Unreferenced vertices would make the mass matrix singular.
+        used, faces = np.unique(thin.faces, return_inverse=True)
         thin = Shape(thin.verts[used], faces.reshape(-1, 3), thin.name)
         with library("ZoomOut"):
             from pyFM.mesh import TriMesh

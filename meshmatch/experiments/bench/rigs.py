@@ -51,10 +51,8 @@ FOLDERS = "men,women,animals,dinosaurs,fish"
 HEIGHT = 180.0  # cm, of the longest side of a target
 Names: TypeAlias = NDArray[np.str_]
 _PATTERNS = {"rocketbox": "*.fbx"}
-_MAX_DRIFT_CM = 1.0  # cm; vertices that move further than this from their bones are counted
-_TOUCHING_DISTANCE = (
-    0.01  # distance from a bone's end, as a fraction of the longest side, within which a joint touches it
-)
+_MAX_DRIFT_CM = 1.0  # vertices that move further than this from their bones are counted
+_TOUCHING_DISTANCE = 0.01  # of a joint from the end of a bone, as a fraction of the longest side
 _AVERAGED = "same", "near", "volume", "volume_own", "further", "further_own", "seconds"
 COLUMNS = {
     "folder": "folder", "pairs": "pairs:d", "good / fair / poor": "verdicts:>", "same joint": "same:.1%",

@@ -157,10 +157,7 @@ def furniture(number: int, rng: np.random.Generator) -> list[Float[Floats, "2 3"
 
 
 def box_union(corners: Sequence[Float[Floats, "2 3"]], cells: int = 48) -> Shape:
-    """Build the union of boxes as one watertight mesh with rounded edges, by marching cubes of their distance field.
-
-    The grid has ``cells`` cells along the longest side.
-    """
+    """Build the union of boxes as one watertight mesh with rounded edges, by marching cubes on a grid of their distances."""
     ends = np.array(corners)
     low, high = ends[:, 0].min(0), ends[:, 1].max(0)
     step = float((high - low).max()) / cells
@@ -327,9 +324,8 @@ class Cases:
 
     def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:
         drawn, faces = self._character_cache.setdefault(kind, []), self.template.shape.faces
-        corners = np.concatenate(
-            [np.arange(self.template.shape.V), faces[:, 0]]
-        )  # template vertex of each vertex of a subdivide_to body
+        # Template vertex of each vertex of the body that `clothed_people` refines.
+        corners = np.concatenate([np.arange(self.template.shape.V), faces[:, 0]])
         while len(drawn) <= number:
             made = clothed_people(self.template, 10, kind, 100 + self.seed + len(drawn))
             drawn += [(each.shape, corners[np.asarray(each.places)]) for each in made]
