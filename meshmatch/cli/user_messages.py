@@ -176,7 +176,7 @@ def names_of(paths: Sequence[Path], names: Sequence[str] = ()) -> list[str]:
 
 
 def raise_if_poor(strict: bool, verdict: str, reasons: Sequence[str], what: str = "the fit") -> None:
-    """With --strict, raise `PoorFit` for a poor fit or map."""
+    """Raise `PoorFit` for a poor fit or map, with --strict."""
     if strict and verdict == "poor":
         raise PoorFit(f"{what} is poor, nothing was written: {join_reasons(reasons)}", _HINT)
 

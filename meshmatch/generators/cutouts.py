@@ -245,7 +245,7 @@ def _intersect_rays(
     rays: Float[Floats, "R 3"],
     reach: Float[Floats, " R"],
 ) -> tuple[Int[Ints, "R 3"], Float[Floats, "R 3"]]:
-    """Of the triangles that each ray intersects, the one whose distance is closest to ``reach``: its vertices and the
+    """Find for each ray the triangle that it intersects closest to the distance ``reach``: its vertices and the
     barycentric weights of the intersection.
     """
     a, b, c = (verts[faces[:, k]] for k in range(3))

@@ -183,7 +183,7 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
     surface = Surface(fit.points, fit.faces, facing, fit.resting)
 
     def fused(rows: Ints, island: Ints, before: Footpoints, after: Footpoints) -> Bools:
-        """Which islands (indexed by number) are limbs that a scan has fused with their surroundings."""
+        """Mask of the islands (indexed by number) that are limbs that a scan has fused with their surroundings."""
         areas = shape.vertex_areas[rows]
         alike = [(normals[rows] * foot.values(fit.faces, facing)).sum(1) for foot in (after, before)]
         sums = [np.bincount(island, areas * each) for each in (after.distance, alike[1] - alike[0])]

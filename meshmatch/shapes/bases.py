@@ -90,7 +90,7 @@ class _Samples:
     def find_inliers(
         self, normal: Float[Floats, "N 3"], offset: Float[Floats, " N"]
     ) -> tuple[Bool[Bools, "P N"], Float[Floats, " N"]]:
-        """Which points lie in each candidate plane, and the distance up to which they do.
+        """Masks of the points in each candidate plane, and the distances up to which they count.
 
         A plane that supports no body has no inliers.
         """

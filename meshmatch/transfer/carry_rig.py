@@ -185,7 +185,7 @@ def _with_world_poses(rig: Rig, rotations: Float[Floats, "N 3 3"], places: Float
 
 
 class _Skin:
-    """Which nodes move vertices, and how they are connected over the skin.
+    """Find the nodes that move vertices, and how they are connected over the skin.
 
     Attributes
     ----------

@@ -1,5 +1,6 @@
 """Docstrings of the public names list what there is: parameters, results, attributes; and their examples run."""
 
+import ast
 import doctest
 import inspect
 import re
@@ -102,3 +103,25 @@ def test_the_examples_on_the_samples_run(
     (tmp_path / "templates").symlink_to(ROOT / "templates")
     monkeypatch.chdir(tmp_path)
     exec(compile(OF_SAMPLES[name], name, "exec"), {"meshmatch": meshmatch, "np": np})
+
+
+HEADLESS = frozenset(("by", "from", "in", "of", "on", "that", "those", "to", "which", "who", "whom", "whose", "with"))
+"""Words with which a first line describes something that it does not name."""
+
+
+def headless(source: str) -> list[str]:
+    """First lines of docstrings that begin with such a word."""
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    texts = [ast.get_docstring(node) for node in ast.walk(ast.parse(source)) if isinstance(node, documented)]
+    return [text.splitlines()[0] for text in texts if text and text.split()[0].lower() in HEADLESS]
+
+
+def test_a_docstring_names_what_it_describes() -> None:
+    modules = sorted((ROOT / "meshmatch").rglob("*.py"))
+    assert [f"{path}: {line}" for path in modules for line in headless(path.read_text("utf-8"))] == []
+
+
+def test_the_rule_sees_a_headless_docstring() -> None:
+    assert headless('def half(n):\n    """Of a number."""\n\nclass A:\n    """Half of a number."""\n') == [
+        "Of a number."
+    ]

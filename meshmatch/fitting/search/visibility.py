@@ -1,4 +1,4 @@
-"""Which part of the fitted template the samples of a shape show; for parts, which do not show all of it."""
+"""The part of the fitted template that the samples of a partial shape show."""
 
 from __future__ import annotations
 
