@@ -42,10 +42,12 @@ from meshmatch.threads import set_threads
 
 @lru_cache(maxsize=64)
 def _seen(bench: BenchSet, name: str) -> Shape:
+    """Load a shape as methods get it."""
     return bench.seen(name)
 
 
 def _fit_one(bench: BenchSet, method: Method, name: str) -> tuple[str, Any, float]:
+    """Fit one shape; return its name, the fit or the error, and seconds."""
     shape = _seen(bench, name)
     started = time.perf_counter()
     try:
@@ -81,6 +83,7 @@ def _map_one(
 
 
 def _run_tasks(task: Any, items: Sequence[Any], threads: int, jobs: int) -> Iterator[Any]:
+    """Map ``task`` over items, in ``jobs`` processes of ``threads`` threads each; yield results in order."""
     if jobs <= 1:
         set_threads(threads)
         yield from map(task, items)
@@ -115,6 +118,7 @@ class SetRun:
 
 
 def _judgement(fit: Any) -> Any:
+    """Return verdict and residual of a fit, or "failed" and the error message."""
     if isinstance(fit, MeshmatchError):
         return ["failed", fit.message]
     residual = getattr(fit, "residual", None)

@@ -4,7 +4,7 @@ All ordered pairs of six shapes of each class are matched. The error is the mean
 the mapped keypoints of the source and those of the target, in units of sqrt(area), times 100; the smallest over the
 symmetries of the class. These are read from its ``symmetry.txt``. A class without that file, such as chairs, has the
 rotations and reflections of its keypoints that at least half of its shapes have, and those of either shape of the pair: a
-round table may be turned by one leg. In table 141 the keypoints of two legs are exchanged between floor and top, unlike in
+round table may be turned by one leg. In table 141 the keypoints of two legs are exchanged with those of its top, unlike in
 all other tables. They are corrected, and a last row gives the mean for the keypoints as marked.
 
 Bearings, cups and mechanical parts are rotationally symmetric, so that only their verdicts count: how many of the maps
@@ -228,6 +228,7 @@ def judge_again(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, Any]:
+    """Return the record of a mapped pair."""
     return {
         "pair": " to ".join(pair),
         **errors_of(folder, pair, mapped.index),
@@ -275,6 +276,7 @@ _Found = Mapping[str, Sequence[dict[str, Any]]]  # measured pairs by class
 
 
 def _all_rows(found: _Found) -> list[dict[str, Any]]:
+    """Concatenate the rows of all classes."""
     return [row for some in found.values() for row in some]
 
 
@@ -316,6 +318,7 @@ def cross_validate(found: _Found) -> dict[str, Any]:
 
 
 def _summary(errors: Float[Floats, " N"]) -> dict[str, Any]:
+    """Summarize errors: number of pairs, mean, median and share under `MAX_ERROR`."""
     mean, median, under = float(errors.mean()), float(np.median(errors)), float((errors < MAX_ERROR).mean())
     return {"pairs": len(errors), "mean": mean, "median": median, "under": under}
 

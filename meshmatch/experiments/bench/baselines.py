@@ -76,6 +76,7 @@ def _untrained(choices: Choices, name: str, label: str, method: Registration | Z
 
 
 def _coded(choices: Choices) -> list[Baseline]:
+    """Return the row of 3D-CODED; it cannot run without a model."""
     if choices.coded is None:
         return [Baseline("coded", "3D-CODED", None, "give --coded MODEL, trained as the help says")]
     card = find_model(choices.coded)[1]
@@ -84,6 +85,7 @@ def _coded(choices: Choices) -> list[Baseline]:
 
 
 def _ours(choices: Choices) -> list[Baseline]:
+    """Return the rows of this project, without and with refinement."""
     card = find_model(choices.model)[1]
     nodes = OurMethod(choices.model, "nodes", choices.seed, threads=choices.threads)
     none = replace(nodes, refine="none")

@@ -103,6 +103,7 @@ class Person:
     moves: Floats
 
     def worn_shape(self, garment: Bound, pose: Pose) -> Shape:
+        """Return a garment on this person, at rest or posed."""
         return garment.refit(self.rest) if pose == "rest" else garment.refit_posed(self.rest, self.moves)
 
 
@@ -172,6 +173,7 @@ def rows_of(
 
 
 def _row(name: str, pose: Pose, found: list[Any]) -> dict[str, Any]:
+    """Compute a table row from the results of all pairs."""
     joined = {key: np.concatenate([each[key] for each in found]) for key in found[0]}
     return {
         **{"garment": name, "pose": pose, "pairs": len(found)},

@@ -138,10 +138,12 @@ def png() -> bytes:
 
 
 def _uri(kind: str, data: bytes) -> str:
+    """Encode data as a data URI."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def nodes(n: int, folder: Path) -> Step:
+    """Read a scene of n nodes with the same name, selected by a pattern."""
     made = [{"mesh": 0, "name": "same", "translation": [float(k), 0, 0]} for k in range(n)]
     path = scene(folder / "nodes.gltf", made)
     return lambda: load_shape(path, only="s*e")
@@ -160,6 +162,7 @@ def chain(n: int, folder: Path) -> Step:
 
 
 def morphs(n: int, folder: Path) -> Step:
+    """Read a mesh with n morph targets."""
     mesh = {"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 0}] * n}], "weights": [0.0] * n}
     path = scene(folder / "morphs.gltf", [{"mesh": 0}], meshes=[mesh])
     return lambda: load_shape(path)
@@ -199,12 +202,14 @@ def sample_colors(path: Path) -> object:
 
 
 def labels(n: int, _: Path) -> Step:
+    """Transfer n labels of vertices."""
     verts, faces = grid(math.isqrt(n) + 2)
     shape = Shape(verts, faces)
     return lambda: pull_labels(VertexMap.identity(shape), shape, np.minimum(np.arange(shape.V), n - 1))
 
 
 def landmarks(n: int, _: Path) -> Step:
+    """Transfer n landmarks."""
     verts, faces = grid(math.isqrt(n) + 2)
     shape = Shape(verts, faces)
     return lambda: push_landmarks(VertexMap.identity(shape), shape, shape, at_vertices(shape, np.arange(n)))

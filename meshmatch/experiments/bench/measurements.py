@@ -63,6 +63,7 @@ def measure_person(
 
 
 def _without_side(measurement: str) -> str:
+    """Remove the side from the name of a measurement."""
     return measurement.removeprefix("left ").removeprefix("right ")
 
 

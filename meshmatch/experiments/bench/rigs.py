@@ -74,7 +74,7 @@ class _Character:
         self.weights: SkinWeights = load_weights(path, self.shape)
         self.places = dict(zip(self.rig.names, self.rig.worlds()[:, :3, 3], strict=True))
         self.above = _parents(self.rig)
-        self.near = neighbours(self.rig, _TOUCHING_DISTANCE * float(np.ptp(self.shape.bounds, axis=0).max()))
+        self.near = neighbors(self.rig, _TOUCHING_DISTANCE * float(np.ptp(self.shape.bounds, axis=0).max()))
 
     def nearest_shared(self, name: str, shared: set[str]) -> str:
         """Return the joint or its nearest ancestor that is in ``shared``; "" if there is none."""
@@ -92,14 +92,16 @@ class _Character:
         )
 
     def moving(self, weights: SkinWeights) -> set[str]:
+        """Return the joints that have weights of at least 3 in total."""
         return {name for name, amount in zip(weights.names, weights.matrix.sum(axis=0), strict=True) if amount >= 3}
 
 
 def _parents(rig: Rig) -> dict[str, str]:
+    """Return the parent of each joint by name; "" for roots."""
     return {name: rig.names[parent] if parent >= 0 else "" for name, parent in zip(rig.names, rig.parents, strict=True)}
 
 
-def neighbours(rig: Rig, touching: float) -> set[tuple[str, str]]:
+def neighbors(rig: Rig, touching: float) -> set[tuple[str, str]]:
     """Find pairs of neighboring joints, in both orders.
 
     A joint is a neighbor of itself, its parent, children and siblings, and of joints within ``touching`` of the end of one
@@ -115,6 +117,7 @@ def neighbours(rig: Rig, touching: float) -> set[tuple[str, str]]:
 
 
 def _distance_from_segment(place: Floats, begin: Floats, end: Floats) -> float:
+    """Return the distance of a point from a line segment."""
     along = end - begin
     share = float(np.clip((place - begin) @ along / max(float(along @ along), 1e-300), 0.0, 1.0))
     return float(np.linalg.norm(begin + share * along - place))

@@ -135,6 +135,7 @@ def load_clouds(folder: Path) -> dict[str, Shape]:
 
 
 def _by_number(name: str) -> tuple[int, str]:
+    """Sort key: numeric names by value, others by name."""
     return (int(name), "") if name.isdigit() else (0, name)
 
 
@@ -144,6 +145,7 @@ def _faust_subject(name: str) -> int:
 
 @cache
 def _landmarks(path: Path, every_vertex: bool) -> Int[Ints, " N"]:
+    """Read the landmarks of a shape; `InputError` if they are not vertices of it."""
     shape = load_shape(path)
     if every_vertex:
         ids = np.arange(shape.V)

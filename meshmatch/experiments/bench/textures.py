@@ -73,6 +73,7 @@ def measure_target(source: Path, target: Path, options: meshmatch.BakeOptions, f
 
 
 def _psnr(one: Floats, two: Floats) -> float:
+    """Compute the PSNR of colors in [0, 1], in decibels."""
     return float(-10 * np.log10(np.square(one - two).mean()))
 
 

@@ -24,8 +24,9 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def _row(name: str, pose: str, centimetres: Any, pairs: int) -> dict[str, Any]:
-    away, scan, truth = centimetres
+def _row(name: str, pose: str, centimeters: Any, pairs: int) -> dict[str, Any]:
+    """Compute a table row from distances to the exact refit, to the scan, and of the exact refit to the scan."""
+    away, scan, truth = centimeters
     return {
         **{"topology": name, "pose": pose, "pairs": pairs, "mean_cm": away.mean(), "high_cm": np.quantile(away, 0.95)},
         **{"scan_cm": scan.mean(), "scan_high_cm": np.quantile(scan, 0.95), "scan_worst_cm": scan.max()},

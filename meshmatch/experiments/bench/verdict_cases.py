@@ -258,6 +258,7 @@ class Cases:
         return {name: Kind(name, 64).generator(7100 + self.seed) for name in GENERATORS}
 
     def _generated(self, kind: str) -> Float[Floats, "N V 3"]:
+        """Return generated shapes of a kind, scaled to `MAX_EXTENT`; they are cached."""
         if kind not in self._generated_cache:
             generator = torch.Generator().manual_seed(7100 + self.seed)
             verts = self._others[kind].draw(_N_BODIES, generator).double().numpy()
@@ -295,6 +296,7 @@ class Cases:
     # Cases that usually have a right fit.
 
     def _cloud(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Sample a body as a noisy point cloud."""
         shape, truth = self.body(number, rng)
         points = sample_surface(shape, int(rng.integers(1_500, 12_000)), rng).points
         near = cKDTree(shape.verts).query(points)[1]
@@ -302,6 +304,7 @@ class Cases:
         return Shape(points + noise, np.empty((0, 3), np.int64)), truth[near]
 
     def _holes(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Cut random holes into a body."""
         shape, truth = self.body(number, rng)
         centers = shape.verts[shape.faces].mean(1)
         kept: Bools = np.ones(shape.F, bool)
@@ -311,18 +314,22 @@ class Cases:
         return faces_kept(shape, truth, kept)
 
     def _scan(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Simulate a scan of a body; vertices far from the body have no counterpart."""
         shape, truth = self.body(number, rng)
         scan = simulate_scan(shape, int(rng.integers(2**31)))
         distance, near = cKDTree(shape.verts).query(scan.verts)
         return scan, np.where(distance < 0.05, truth[near], -1)
 
     def _dressed(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Return a clothed person."""
         return self._character(number, PLAIN)
 
     def _stylised(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Return a stylized person or a child, by turns."""
         return self._character(number, (TOON, CHILD)[number % 2])
 
     def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:
+        """Return a generated person of a style in clothes; people are drawn in batches and cached."""
         drawn, faces = self._character_cache.setdefault(kind, []), self.template.shape.faces
         # Template vertex of each vertex of the body that `clothed_people` refines.
         corners = np.concatenate([np.arange(self.template.shape.V), faces[:, 0]])
@@ -336,6 +343,7 @@ class Cases:
         return {}
 
     def _inside_out(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Reverse the faces of a body."""
         shape, truth = self.body(number, rng)
         return Shape(shape.verts, shape.faces[:, ::-1]), truth
 
@@ -359,10 +367,12 @@ class Cases:
         return Shape(warp(shape, rng), shape.faces), truth
 
     def _mirrored(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Reflect a body; left and right of the truth are exchanged."""
         shape, truth = self.body(number, rng)
         return Shape(shape.verts * [-1, 1, 1], shape.faces[:, ::-1]), self._opposite[truth]
 
     def _limb(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Cut a limb out of a body."""
         shape, truth = self.body(number, rng)
         kept = self._in_limb(truth, rng)[shape.faces].all(1)
         return faces_kept(shape, truth, np.asarray(kept))
@@ -378,15 +388,18 @@ class Cases:
         return np.asarray(np.isin(labels[truth], asked))
 
     def _cut(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Keep what is on one side of a random plane."""
         shape, truth = self.body(number, rng)
         return faces_between(shape, truth, direction(rng), rng.uniform(0.1, 0.75), 1.0)
 
     def _merged(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Merge two bodies, near each other."""
         (one, first), (other, second) = self.body(number, rng), self.body(number + 1, rng)
         apart = rng.uniform(0.0, 0.8) * direction(rng)
         return concatenate(one, other, other.verts + apart), np.concatenate([first, second])
 
     def _floor(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Add a floor to a body."""
         shape, truth = self.body(number, rng)
         whole = on_floor(shape, rng.uniform(0.8, 6.0))
         return whole, np.append(truth, np.full(whole.V - shape.V, -1))
@@ -400,10 +413,12 @@ class Cases:
         return as_unrelated(verts[int(rng.integers(len(verts)))], np.asarray(self._others[kind].template.shape.faces))
 
     def _furniture(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Draw watertight furniture."""
         whole = box_union(furniture(number, rng))
         return as_unrelated(whole.verts, whole.faces)
 
     def _solid(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Draw overlapping solids."""
         whole = random_solids(rng)
         return as_unrelated(whole.verts, whole.faces)
 
@@ -415,6 +430,7 @@ class Cases:
     # Held-out families: nothing is tuned on these.
 
     def _amputated(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
+        """Remove a limb from a body."""
         shape, truth = self.body(number, rng)
         lost = self._in_limb(truth, rng, 8)[shape.faces].all(1)
         return faces_kept(shape, truth, np.asarray(~lost))

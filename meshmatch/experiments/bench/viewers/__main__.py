@@ -52,6 +52,7 @@ SUMMARY = {
 
 
 def _rows(files: list[Made], valid: Found | None, opened: dict[str, Found], pictures: Path) -> list[dict[str, Any]]:
+    """Compare each file with what the tools found and drew; return a row for each."""
     rows = []
     for each in files:
         written = Written.of(each.path)

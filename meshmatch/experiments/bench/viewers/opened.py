@@ -53,6 +53,7 @@ def check_tools(tools: Sequence[str], modules: Path) -> None:
 
 
 def _chromium() -> str:
+    """Return the path of Chromium; `OptionError` if there is none."""
     found = os.environ.get(_VARIABLE) or next(filter(None, map(shutil.which, _CHROMIUM)), None)
     if found is None:
         raise OptionError(
