@@ -1,6 +1,6 @@
 """Collections of biological specimens, and of other shapes, matched without a model and by other methods.
 
-The specimens of a set are rotated at random and remeshed independently. In sets with sides every third one is a mirror
+The specimens of a set are rotated at random and triangulated independently. In sets with sides every third one is a mirror
 image, and the last two femurs are cut by a plane. Ground truth: femurs are in correspondence, as are molars, leaves and
 knees, which are generated (`meshmatch.experiments.makers.molars_and_leaves`); hearts share vertices of the mesh that they
 were decimated from; busts and birds have keypoints, up to the symmetries of their class. Errors are over all ordered pairs:
