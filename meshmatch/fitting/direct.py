@@ -56,7 +56,7 @@ _MAX_SAME_DIFFERENCE = 0.1
 # creatures in other poses. The second, smaller limit holds if the relief correlates less than the third number, as for a
 # palm on the back of a hand: 0.6 to 0.71, but 0.8 for two hands of one side. The mirror image is accepted if its energy is
 # below the fourth number as a share: 0.64 to 0.97 for hands, 1 for symmetric shapes.
-_MIRROR_LEAD, _MIRROR_LEAD_IF_UNLIKE, _MIN_RELIEF, _MIRROR_ENERGY_RATIO = 0.15, 0.03, 0.75, 0.93
+_MIRROR_LEAD, _MIRROR_LEAD_IF_UNLIKE, _MIN_LIKENESS, _MIRROR_ENERGY_RATIO = 0.15, 0.03, 0.75, 0.93
 # If no rigid motion brings the shapes nearer than the first number, poses differ; the mirror image is then accepted only if
 # the difference of relief falls below the second number as a share: 0.24 to 0.92 for hands, mostly below 0.6; 0.5 to 1 for
 # animals, mostly above 0.75.
@@ -97,7 +97,7 @@ class DirectMatch:
     tried : kind of proposal and energy of each fit that was compared in the end, best first
     system : deforms the template by node vectors; if the source is the template, one system serves all of its targets
     leads : energies of the fits that differ from the best one, minus its energy
-    over_guess : energy of the guess minus that of the best fit; 0 if they are the same map, infinite without a guess
+    guess_lead : energy of the guess minus that of the best fit; 0 if they are the same map, infinite without a guess
     earlier : computes the match that the first direction alone would have given, if both directions were used
     turns : number of rotations that map one of the shapes onto itself, and thus of equally good maps
     apart : distances (units of sqrt(area)) that rigid motions leave between the shapes, and between the source and the
@@ -191,7 +191,7 @@ def match_either_side(
     search = _Search.of(source, target, config, known, guess)
     plain_fits = search.one_way(report.stage("", 0.0, 0.3), [lambda: search.apart])
     mirror_lead = float(np.log(search.apart[0] / search.apart[1]))
-    if mirror_lead < (_MIRROR_LEAD_IF_UNLIKE if plain_fits[0].features.likeness < _MIN_RELIEF else _MIRROR_LEAD):
+    if mirror_lead < (_MIRROR_LEAD_IF_UNLIKE if plain_fits[0].features.likeness < _MIN_LIKENESS else _MIRROR_LEAD):
         return replace(search.matched(plain_fits, report, began), apart=search.apart)
     known, guess = (pairs and (pairs[0], MIRROR.apply(pairs[1])) for pairs in (known, guess))
     image = _Search.of(source, mirrored(target), config, known, guess)
@@ -336,8 +336,8 @@ class _Search:
         best = distinct(found, self.source.config.n_slid, _MAX_SAME_DIFFERENCE)
         sides = (self.source, self.target), (self.target, self.source)
         tasks = [
-            partial(slide, *sides[backward], (each.forward, each.backward)[backward])
-            for backward in (0, 1)
+            partial(slide, *sides[direction], (each.forward, each.backward)[direction])
+            for direction in (0, 1)
             for each in best
         ]
         moved = parallel_calls(tasks)
@@ -409,8 +409,8 @@ class _Search:
 class _Judged:
     """Fits, best first, and their judgement.
 
-    Fits differ if more than ``min_difference`` of the vertices do. ``earlier`` are the fits of one direction, if they left
-    doubt.
+    Fits differ if more than ``min_difference`` of the vertices do. ``earlier`` are the fits of one direction, if these
+    are of both.
     """
 
     found: Sequence[ShapeFit | _BothWays]

@@ -73,7 +73,7 @@ class Fit(PickledFields):
     signs
         The features by which it was judged; None if it was read from a file.
     left_out
-        Numbers of the shape's parts that were left out because a fit of the whole failed; see `meshmatch info`.
+        Numbers of the shape's parts that were left out, as only the others are of the model's kind; see `meshmatch info`.
     regularity
         Share of template vertices where the deformation folds (det F <= 0), and mean change of volume, under these node
         vectors; None if it was read from a file without them.

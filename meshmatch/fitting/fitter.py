@@ -35,13 +35,13 @@ from meshmatch.templates.template import Template
 
 _HINT = "one target vertex for each source vertex, both counted from 0"
 # All set by hand. Boundary lengths and distances are in units of sqrt(area).
-_PART_UNCOVERED = 0.06  # a fit of the whole with at least this share of the template uncovered may be one of a part
+_PART_UNCOVERED = 0.06  # a fit of the whole with more than this share of the template uncovered may be one of a part
 _MIN_BOUNDARY = 0.3  # a shape with a boundary at least this long may be a part
 # Boundary that a badly fitted shape needs where the template is covered; characters built of parts have up to 0.5.
 _MIN_BOUNDARY_IF_COVERED = 1.0
 _PART_CONTACT = 0.06  # boundary edges this close to another part of the shape are not counted as cut
 _PART_RESIDUAL_RATIO = 0.85  # a fit as a part is accepted below this multiple of the whole's residual
-_MIN_HIDDEN = 0.03  # and if the part lacks at least this share of the surface
+_MIN_HIDDEN = 0.03  # and if the part lacks more than this share of the surface
 _CLEAR_SIDE_RATIO = 0.95  # handedness is clear if the residual is at most this multiple of the other side's
 
 

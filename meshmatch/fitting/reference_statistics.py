@@ -26,8 +26,8 @@ MIN_FAIR_TRUST = 0.5
 """Least trust of a fair fit, as for two shapes without a model."""
 _GOOD_TRUST = 0.9
 _SUPERSEDED_REASONS = ("unsupervised", "doubt", "residual", "outlier")  # dropped, as the comparison judges these anew
-_DOUBTFUL_SIDE = 0.1  # a fit is doubtful if its mirror image fits better by this much, see `Fit.side`
-_OUTLIER_RATIO = 1.5  # multiple of the typical value from which on a fit is reported as an outlier
+_DOUBTFUL_SIDE = 0.1  # a fit is doubtful if its mirror image fits better by more than this, see `Fit.side`
+_OUTLIER_RATIO = 1.5  # multiple of the typical value above which a fit is reported as an outlier
 # A kind has sides if at least a share of `_MIN_CLEAR_SHARE` of its shapes has |`Fit.side`| above `_CLEAR_SIDE`. Molars have
 # 0.19 and more, cut femurs 0.17. Birds, which have no sides, have up to 0.01, and half of the leaves less than the limit.
 _CLEAR_SIDE, _MIN_CLEAR_SHARE = 0.15, 0.8

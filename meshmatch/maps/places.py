@@ -28,9 +28,8 @@ from meshmatch.maps.mapped_mesh import MappedMesh
 from meshmatch.shapes.repair import Repaired
 from meshmatch.shapes.shape import Shape
 
-_MAX_HEIGHT = (
-    0.03  # largest height, units of sqrt(area): what is farther off is not the template's surface. Set by hand.
-)
+# Largest height (units of sqrt(area)): what is farther off is not the template's surface. Set by hand.
+_MAX_HEIGHT = 0.03
 # For noisy clouds, set by hand:
 _MIN_NOISY_ROUGHNESS = 0.5  # from this `Shape.roughness` on, noise is larger than the template's triangles
 _N_SAMPLES = 48  # nearest samples of the template over which the expectation of a point is taken

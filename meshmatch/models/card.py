@@ -35,9 +35,8 @@ MIRRORINGS = ("auto", "no")
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 _OLD_FRAME = {"orientation": "searched", "scale": "area"}
-_OLD_DEFAULTS: dict[
-    int, dict[str, Any]
-] = {  # by schema: entries that cards of older schemas lack, and their implied values
+# By schema: entries that cards of older schemas lack, and their implied values.
+_OLD_DEFAULTS: dict[int, dict[str, Any]] = {
     1: {"frame": _OLD_FRAME, "stiffness": 1.0, "mirror": "no"},
     2: {"stiffness": 1.0, "mirror": "no"},
     3: {"mirror": "no"},
@@ -52,9 +51,8 @@ _TYPES: dict[str, tuple[type, str]] = {  # by annotation: type, and its name in 
     "list[list[float]]": (list, "a list"),
 }
 _FIELD_KEYS = {"kernel": "str", "radius": "float", "nodes": "int"}
-_CONDITIONS: dict[
-    str, tuple[Callable[[Any], object], str]
-] = {  # conditions on entries: predicate, and its name in messages
+# Conditions on entries: predicate, and its name in messages.
+_CONDITIONS: dict[str, tuple[Callable[[Any], object], str]] = {
     "template_hash": (re.compile("[0-9a-f]{16}").fullmatch, "16 hex digits"),
     "weights_sha256": (re.compile("[0-9a-f]{64}").fullmatch, "64 hex digits"),
     "steps": (lambda count: count >= 0, "0 or more"),

@@ -18,7 +18,7 @@ from meshmatch.geometry.symmetric import to_entries, to_matrices
 from meshmatch.models.tensor_file import read_header
 from meshmatch.outputs import replace_on_success
 
-_MAX_COMPONENTS = 512  # components
+_MAX_COMPONENTS = 512  # maximum number of principal components in a file
 _MAX_LOG_ODDS = 30.0  # bound on the natural logarithm of odds
 # Ranges over which `PairStatistics.concern` falls from 1 to 0, because two unclothed individuals do not differ as much: mean
 # square of a difference relative to that of two individuals, and median norm of its matrices. Among pairs of people of FAUST

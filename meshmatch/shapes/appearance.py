@@ -70,7 +70,7 @@ class Finish:
 
     Each layer has materials and coordinates of its own, like the colors: "normal", directions in the tangent frame;
     "surface", with roughness in green and metalness in blue; "occlusion" in red; "glow", emitted light, in units of
-    `srgb_to_linear_alpha`. A missing layer is not specified by the file.
+    `light`. A missing layer is not specified by the file.
     """
 
     layers: Mapping[Layer, Appearance]

@@ -125,7 +125,7 @@ def _equivalent_entries(folder: Path, name: str) -> list[str]:
 
 @lru_cache(maxsize=4)
 def _entries(folder: Path, state: tuple[int, int, int]) -> dict[str, list[str]]:
-    """Names in a folder, grouped by their folded form; `state` identifies its content in the cache."""
+    """Names in a folder, grouped by their canonical form; `state` identifies its content in the cache."""
     entries: dict[str, list[str]] = {}
     for entry in os.listdir(folder):
         entries.setdefault(canonical_name(entry), []).append(entry)

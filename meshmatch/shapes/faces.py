@@ -17,7 +17,8 @@ _MIN_FAR_GAP = 0.25  # minimum gap between big parts that are far apart, in diag
 # minimum length of a sheet's mean normal: 0.5 for half a sphere, 0.64 for half a cylinder, 0.9 for leaves
 _MIN_SHEET_NORMAL = 0.8
 _DEGENERATE_LENGTH = 1e-9  # maximum length of a degenerate edge, as a fraction of the median edge
-# vertices needed to detect spikes, hulls and grounds; quantile of the usual distance from the middle
+# Vertices needed to detect spikes, and faces of other parts to detect hulls and grounds; quantile of the distances from the
+# middle that is the usual one.
 _MIN_VERTICES, _USUAL_QUANTILE = 100, 0.99
 # minimum length of a spike, in usual distances; maximum width of its foot, in its lengths
 _MIN_SPIKE_LENGTH, _MAX_SPIKE_WIDTH = 1.5, 0.1

@@ -169,7 +169,7 @@ def parse_json(name: str, data: bytes) -> Any:
 
 
 def check_memory(name: str, size: int, need: int) -> None:
-    """`InputError` if a file of ``size`` bytes would ``need`` more memory than four times its size plus a gigabyte."""
+    """`InputError` if a file of ``size`` bytes would ``need`` more memory than four times that plus `MEMORY_ALLOWANCE`."""
     if need > 4 * size + MEMORY_ALLOWANCE:
         large = f"{name} promises too much: of {size / 1e6:,.0f} MB it would make {need / 1e9:.1f} GB"
         raise InputError(large, "make it smaller, or save it uncompressed in a binary format")

@@ -58,7 +58,7 @@ class Repaired(ShortRepr):
     far_parts
         Number of big parts that lie far from the largest one: perhaps two objects in one file. They are kept.
     left_out
-        Numbers of parts (`meshmatch.shapes.parts`) that were excluded because the others fit better alone.
+        Numbers of parts (`meshmatch.shapes.parts`) that were left out, as only the others are of the model's kind.
     copied
         (V_original,) vertices that were dropped with a copy of all kept parts, such as the same figure at another node
         of a scene; their counterparts represent them.

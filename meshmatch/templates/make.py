@@ -77,7 +77,7 @@ class NodeConfig:
 def low_mesh(
     shape: Shape, faces: int = LOW_FACES, quality: Quality = "fast"
 ) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
-    """Decimate a mesh to a subset of its vertices, or triangulate a cloud; returns indices of the vertices, and faces."""
+    """Decimate a mesh to a subset of its vertices, or triangulate a cloud; returns which vertices are kept, and faces."""
     if shape.is_cloud:
         return triangulate_cloud(shape, faces)
     if shape.F <= faces:

@@ -112,7 +112,7 @@ def save_template(template: Template, path: str | Path) -> None:
 
 
 def save_arrays(path: str | Path, arrays: dict[str, np.ndarray], words: dict[str, str] | None = None) -> None:
-    """Write one safetensors file, with ``metadata`` as metadata."""
+    """Write one safetensors file, with ``words`` as its metadata."""
     with replace_on_success(path) as temporary:
         save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, words)
 

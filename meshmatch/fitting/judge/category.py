@@ -79,7 +79,7 @@ class CategoryResiduals:
     def ask(self, rows: Iterable[int], numbers: Iterable[int]) -> None:
         """Compute the residuals for some models (``rows``) and some shapes (``numbers``)."""
         entries = [(row, number) for row in rows for number in numbers]
-        for place, value in zip(entries, parallel_map(lambda entries: self._read(*entries), entries), strict=True):
+        for place, value in zip(entries, parallel_map(lambda entry: self._read(*entry), entries), strict=True):
             self.found[place] = value
 
     def _read(self, row: int, number: int) -> float:

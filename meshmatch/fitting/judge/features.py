@@ -48,13 +48,11 @@ _FLIPPED_IF_UNSIGNED = 0.015  # assumed share for clouds, whose normals have no 
 # part's border that was not cut (1 % if right and fair, 41 to 82 % for limbs fitted as more than that).
 _LOGIT_ALONE = 8.0
 _MAX_FORWARD, _MAX_ASTRAY, _MAX_UNCUT = 27.0, 0.03, 0.3
-_MIN_ASIDE = (
-    0.022  # mean distance from the template (units of sqrt(area), 3 cm on a person) of a piece that lies next to it
-)
+# A piece lies next to the template if its mean distance is larger than this (units of sqrt(area), 3 cm on a person).
+_MIN_ASIDE = 0.022
 _MIN_HIDDEN_PIECE = 0.05  # hidden pieces with a smaller share of the area, in ears or between fingers, were not cut off
-_MAX_CUT_DISTANCE = (
-    0.12  # a border that is farther than this from an edge of the shape (units of sqrt(area)) is not a cut
-)
+# A border that is farther than this from an edge of the shape (units of sqrt(area)) is not a cut.
+_MAX_CUT_DISTANCE = 0.12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +61,8 @@ class FitFeatures:
 
     Attributes
     ----------
-    residual : mean distance between template and shape, normals included, minus what the noise of a cloud or the parts of a
-        figure explain (units of sqrt(area))
+    residual : mean distance between template and shape, normals included, without what the noise of a cloud or the parts of
+        a figure explain (subtracted in quadrature; units of sqrt(area))
     uncovered_shape : share (0..1) of the shape that the template does not reach
     uncovered_template : share (0..1) of the template where the shape has no surface; 0 for a part
     discontinuous : share (0..1) of neighbouring samples whose template points are farther apart than local shortening

@@ -124,9 +124,8 @@ def candidates_of_whole(task: FitTask) -> tuple[FitTask, list[Candidate]]:
     best = best_first(task.predictor.fit_all([(task.samples, each.pose) for each in chosen]))
     orientation(0.8)
     unusual = best[0].residual > SETTINGS.unusual_residual and not task.shape.is_cloud
-    if (
-        unusual and task.config.partial != "yes" and not task.config.again
-    ):  # with `again`, a poor fit is repeated anyway
+    # with `again`, a fit with a specific reason against it is repeated anyway, with this search
+    if unusual and task.config.partial != "yes" and not task.config.again:
         best = best_first([*best, *_candidates_from_all_rotations(task)])
     best += _half_turned(task, best[0])
     orientation(1.0)

@@ -31,9 +31,8 @@ _MIN_USER_COSINE = 0.5  # between an axis of a frame and the user's axis
 MIN_AXIS_COSINE = 0.85
 """Cosine above which an axis of a frame counts as a given one, such as the file's."""
 _N_ANYWHERE = 144  # rotations to try for a shape in a pose that the aligner does not know
-_CORE_BELOW = (
-    0.15  # how far the core is then assumed below the shape's centroid, along its up axis (units of sqrt(area))
-)
+# How far the core is then assumed below the shape's centroid, along its up axis (units of sqrt(area)).
+_CORE_BELOW = 0.15
 _SPIRAL = 1.533751168755204288118041  # the solution of x ** 4 = x + 4
 _AGREE = 30  # degrees: votes that are closer agree. Set by hand.
 # Possible errors of a vote, as rotations of the core frame: none, half turns about y, x and z, quarter turns about y.

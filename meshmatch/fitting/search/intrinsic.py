@@ -32,13 +32,11 @@ _MIN_AREA = 1e-12  # regularization for vertices whose triangles have no area
 _N_LANDMARKS = 300  # evenly spread vertices that represent all
 _N_DISTANCES = 12  # number of distances in the area profile of an extremity
 # Shares of the diameter along the surface: an extremity is a maximum of the eccentricity with at least the first
-# persistence, at least the second distance away from the others. The third number is the maximum number of extremities.
+# persistence, farther than the second number from the others. The third number is the maximum number of extremities.
 _MIN_PERSISTENCE, _MIN_DISTANCE, _MAX_EXTREMITIES = 0.04, 0.08, 14
 _PATH_SHARES = (0.15, 0.3, 0.5, 0.7)  # shares of the paths from the center to extremities at which paths are compared
-_RING_SHARES, _RING_HALF_WIDTH = (
-    (0.25, 0.5, 0.75),
-    0.03,
-)  # shares of the paths at which there are rings, and half the width of a ring
+# Shares of the paths at which there are rings, and half the width of a ring.
+_RING_SHARES, _RING_HALF_WIDTH = (0.25, 0.5, 0.75), 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +84,8 @@ class SimplifiedMesh:
         """
         stiffness, mass = robust_laplacian.mesh_laplacian(self.verts, self.faces)
         ranks = []
-        shortest = np.sqrt(
-            2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces)
-        )  # about the length of an edge
+        # about the length of an edge
+        shortest = np.sqrt(2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces))
         for length in np.maximum(_SMOOTHING_LENGTHS, shortest):
             system = csc_matrix(mass + length**2 * stiffness + _MIN_AREA * identity(len(self.verts)))
             smooth = splu(system).solve(mass @ self.verts)

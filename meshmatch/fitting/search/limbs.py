@@ -39,7 +39,7 @@ class LimbSettings:
     cluster_distance : uncovered samples that are closer than this belong to one region
     min_share : share of all samples that an uncovered region must have: fits of 58 bodies of SCAPE, FAUST and SHREC'19
         leave none
-    turned_joints : maximum number of consecutive joints that are turned, from the limb's end or the piece before it
+    max_turned_joints : maximum number of consecutive joints that are turned, from the limb's end or the piece before it
     sweeps : how often each of these joints is turned
     max_miss : largest distance that may remain between the centroids of the limb and of the region
     min_labels : a limb with fewer labels is not considered tangled with others
@@ -50,7 +50,7 @@ class LimbSettings:
     uncovered_distance: float = 0.06
     cluster_distance: float = 0.05
     min_share: float = 0.01
-    turned_joints: int = 3
+    max_turned_joints: int = 3
     sweeps: int = 4
     max_miss: float = 0.08
     min_labels: int = 3
@@ -129,7 +129,7 @@ class Limbs:
                 chain.append(parent)
             pieces = [limbs[each][0] for each in chain]
             for first in range(min(2, len(pieces))):
-                for last in range(first + 1, min(first + SETTINGS.turned_joints, len(pieces)) + 1):
+                for last in range(first + 1, min(first + SETTINGS.max_turned_joints, len(pieces)) + 1):
                     self.bends.append(Bend(pieces[0], tuple(pieces[first:last][::-1])))
         self.bends.sort(key=lambda bend: len(bend.turned_joints))
         label_verts = {name: np.flatnonzero(template.labels == name) for name in range(len(template.label_names))}

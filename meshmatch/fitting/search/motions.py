@@ -15,8 +15,8 @@ from meshmatch.geometry.oriented import OrientedPoints, feature_tree, with_norma
 
 _SCALE = 0.1  # scale of the robust weight, in units of sqrt(area). Set by hand on 30 pairs of 15 kinds of shapes.
 _N_QUERIES = 200  # points of each mesh that are paired with the closest point of the other
-# A rotation is a symmetry if its residual (both ways, normals included; units of sqrt(area)) is at most
-# `_MAX_SYMMETRIC_RESIDUAL`, and if at least a share of `_MIN_MOVED_SHARE` of the vertices move farther than
+# A rotation is a symmetry if its residual (both ways, normals included; units of sqrt(area)) is below
+# `_MAX_SYMMETRIC_RESIDUAL`, and if more than a share of `_MIN_MOVED_SHARE` of the vertices move farther than
 # `_MIN_DISPLACEMENT`. Vertices of 2,400 triangles are never nearer than about 0.01. Bearings come to 0.01 to 0.02, tables
 # to 0.015 to 0.025, pliers, which are turned over, to 0.024 to 0.029; of 90 shapes with a front the nearest, a plane, comes
 # to 0.039.

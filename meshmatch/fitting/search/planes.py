@@ -21,10 +21,8 @@ _NORMAL_WEIGHT = 0.1  # weight of unit normals against positions
 _FAR = 0.08, 0.03  # scale of the robust weight when planes are compared, after the first and the last stage
 _FIRST = (*(0.15,) * 3, *(0.1,) * 5)  # scales of the robust weight in the steps of the first stage
 _LAST = (*np.geomspace(0.1, 0.02, 15), *(0.02,) * 8)  # and of the last stage
-_ALIKE, _SAME = (
-    np.cos(np.radians(8)),
-    np.cos(np.radians(5)),
-)  # cosines between normals of planes that count as one, likewise
+# Planes count as one if the cosine between their normals is larger than this, after the first and the last stage.
+_ALIKE, _SAME = np.cos(np.radians(8)), np.cos(np.radians(5))
 _APART = 0.05  # distance of planes that count as different after the first stage
 
 

@@ -182,7 +182,7 @@ def _orientation_preserved(source: Intrinsic, target: Intrinsic, vertex: Int[Int
 
 
 def extremity_proposals(source: Intrinsic, target: Intrinsic) -> list[Proposal]:
-    """Maps of limbs that send extremities to extremities, found by beam searches.
+    """Maps of limbs that send extremities to extremities, found by beam searches and cyclic searches.
 
     Assignments are compared by the distances between extremities, by how much of the paths from the center to two of them
     is shared, by the order in which these paths lie around the shape, and by how well a rotation takes limbs to limbs.

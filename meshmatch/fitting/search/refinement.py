@@ -58,8 +58,8 @@ class RefinementSettings:
     ----------
     discontinuity_cost : added to the residual of a map that is discontinuous everywhere
     cap : maximum distance that counts
-    different_share, different_distance : two candidates differ if at least this share of the template's vertices is at
-        least this far apart
+    different_share, different_distance : two candidates differ if more than this share of the template's vertices is
+        farther apart than this distance
     same_distance, max_averaged : candidates closer than this distance are averaged, at most this many
     pool : how many of the best candidates are searched for ones that differ
     screening_margin : after screening, a candidate is dropped if its score exceeds this multiple of the best one's: on 78

@@ -61,8 +61,8 @@ def with_thick_part_smaller(found: Registration) -> Registration | None:
     task, best = found.task, found.candidate
     if not (task.samples.signed and task.system.linear):
         return None
-    template_radius, ball = template_ball_radius(task.model), largest_ball(task.samples, SETTINGS.n_balls)
-    if template_radius is None or ball is None or ball[1] < SETTINGS.min_ball_ratio * template_radius:
+    rest_radius, ball = template_ball_radius(task.model), largest_ball(task.samples, SETTINGS.n_balls)
+    if rest_radius is None or ball is None or ball[1] < SETTINGS.min_ball_ratio * rest_radius:
         return None
     comparison = WholeComparison(task, [])
 

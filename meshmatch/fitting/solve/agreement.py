@@ -34,7 +34,7 @@ from meshmatch.models.trained import TrainedModel
 
 _MIN_STRETCH = 1e-3  # smaller stretches are raised to this, so that logarithms are finite
 _LIKENESS_EXPONENT = 8  # steepness of `likeness`; set by hand
-_SAME = 0.99  # shapes with at least this likeness share the stretch entirely
+_SAME = 0.99  # shapes with more than this likeness share the stretch entirely
 _KNOWN_STEPS = 12  # number of steps if the statistics of pairs are used
 
 

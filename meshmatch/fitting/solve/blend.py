@@ -76,8 +76,7 @@ def polar(F: Float[Floats, "N 3 3"]) -> tuple[Float[Floats, "N 3 3"], Float[Floa
 class FieldPath:
     """Poses between several fits of one template, by the deformation gradients at its gradient points.
 
-    Keys are node vectors (K, 3) of the fits, each in its core frame; the core moves on a straight line between its
-    positions.
+    Keys are node vectors (K, 3) of the fits, each in its core frame; the core's mean displacement is blended linearly.
     """
 
     def __init__(self, system: NodeSystem, keys: Sequence[Floats], core: Int[Ints, " C"]) -> None:
@@ -87,15 +86,13 @@ class FieldPath:
         self.stretches = StretchBlend([logs for _, logs in parts])
         self._parent, self._levels = _spanning_order(system, rotations, core)
         child = np.flatnonzero(self._parent >= 0)
-        relative = [
-            rotation.copy() for rotation in rotations
-        ]  # rotations relative to each point's parent; absolute for roots
+        # relative to the rotation of each point's parent; absolute for roots
+        relative = [rotation.copy() for rotation in rotations]
         for own, whole in zip(relative, rotations, strict=True):
             own[child] = whole[self._parent[child]].transpose(0, 2, 1) @ whole[child]
         self._joints = RotationBlend(relative)
-        self._core = np.asarray(
-            system.phi[core].mean(0)
-        ).ravel()  # weights of the node vectors in the core's mean displacement
+        # weights of the node vectors in the core's mean displacement
+        self._core = np.asarray(system.phi[core].mean(0)).ravel()
 
     def __call__(self, weights: Float[Floats, " n"]) -> Float[Floats, "K 3"]:
         """Node vectors for weights of the keys that sum to one."""
