@@ -49,7 +49,7 @@ _EARLY_ENERGY = "features.early_energy"
 _NEIGHBOURS = 3  # number of vertices of the coarse mesh from which a vertex of the fine mesh is interpolated
 
 
-def _pairs(
+def _stage(
     steps: int,
     prior: tuple[float, float],
     scale: tuple[float, float],
@@ -99,11 +99,11 @@ class DirectConfig:
     first_samples: int = 1200
     coarse_nodes: SurfaceNodes = _COARSE_NODES
     fine_nodes: SurfaceNodes = _FINE_NODES
-    first: NodeRefineConfig = field(default_factory=lambda: _pairs(4, (3e-3, 1e-3), (0.12, 0.07), 1200))
-    second: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (1e-3, 1e-4), (0.1, 0.03), 1500))
-    third: NodeRefineConfig = field(default_factory=lambda: _pairs(8, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.1, 0.6))
-    slide: NodeRefineConfig = field(default_factory=lambda: _pairs(24, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.02, 0.8))
-    last: NodeRefineConfig = field(default_factory=lambda: _pairs(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
+    first: NodeRefineConfig = field(default_factory=lambda: _stage(4, (3e-3, 1e-3), (0.12, 0.07), 1200))
+    second: NodeRefineConfig = field(default_factory=lambda: _stage(8, (1e-3, 1e-4), (0.1, 0.03), 1500))
+    third: NodeRefineConfig = field(default_factory=lambda: _stage(8, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.1, 0.6))
+    slide: NodeRefineConfig = field(default_factory=lambda: _stage(24, (3e-4, 1e-4), (0.06, 0.02), 4000, 0.02, 0.8))
+    last: NodeRefineConfig = field(default_factory=lambda: _stage(6, (1e-4, 3e-5), (0.03, 0.02), 4000))
     n_second: int = 16
     n_third: int = 6
     n_slid: int = 2

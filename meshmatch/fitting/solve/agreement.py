@@ -180,7 +180,8 @@ class CommonStretch:
 def likeness(log: Float[Floats, "G 3 3"], others: Sequence[Float[Floats, "G 3 3"]], half: float) -> float:
     """How much (0..1) one of several shapes is like the others, by the logarithms of their stretches.
 
-    It is 0.5 if the median difference over the template is ``half``; for two shapes this is the difference between them.
+    It is 0.5 if the median over the template of twice its difference from their mean is ``half``; for two shapes, that
+    is their difference from each other.
     """
     apart = 2 * (log - mean_log(others))
     distance = float(np.median(np.linalg.norm(apart.reshape(len(log), -1), axis=1)))
