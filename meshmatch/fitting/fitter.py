@@ -48,8 +48,9 @@ _CLEAR_SIDE_RATIO = 0.95  # handedness is clear if the residual is at most this 
 class Fitter:
     """Fits the template of one model to shapes. Instances are immutable and can be shared by threads.
 
-    Whatever depends on the model alone is built once and shared by all of its fitters. ``progress`` is called with (stage,
-    name of the shape, completed share of the stage); an exception that it raises ends the fit.
+    Whatever depends on the model alone is built once and shared by all of its fitters, even if threads request it at the
+    same time. ``progress`` is called with (stage, name of the shape, completed share of the stage); an exception that it
+    raises ends the fit.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ def frames_to_try(
 ) -> list[RigidPose]:
     """Core frames to try: those of the category, of the aligner (or a grid without one), or those that fit the user's axes.
 
-    If the file states that the shape is ``upright``, the upright frame is tried too.
+    If the file states that the shape is ``upright`` and no frame of the aligner is, the upright frame is tried too.
     """
     frames = aligned_frames(model, samples)
     if frames is None and not model.inference.config.align_basis:
