@@ -113,7 +113,7 @@ class CallBatcher:
 def batched_call(answer: Callable[[Sequence[Question]], Sequence[Answer]], question: Question) -> Answer:
     """The answer to one question, from a function that answers several.
 
-    Calls are batched inside `Gathering.together`, and made alone outside.
+    Calls are batched inside `CallBatcher.together`, and made alone outside.
     """
     gathering: CallBatcher | None = getattr(_thread_state, "gathering", None)
     return answer([question])[0] if gathering is None else gathering.ask(answer, question)

@@ -97,7 +97,7 @@ class TexturedResult(ShortRepr):
             return compose_shapes([(shape, find_appearance(path, shape))])
 
     def save(self, path: str | Path) -> None:
-        """Write a .glb, or an .obj with an .mtl and a .png of the same name.
+        """Write a .glb (or a .vrm, if the target is one), or an .obj with an .mtl and a .png of the same name.
 
         If the target's file has the same format, everything but the texture is kept.
 
@@ -109,7 +109,8 @@ class TexturedResult(ShortRepr):
         Raises
         ------
         OptionError
-            The suffix is not supported; or it is .glb, and the target's texture coordinates lie in several tiles.
+            The suffix is not supported; or it is .glb, and the target's texture coordinates lie in several tiles; or it is
+            .vrm, and the target is not a .vrm.
         OutputError
             A file cannot be written.
         """

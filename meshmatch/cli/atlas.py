@@ -183,7 +183,9 @@ def _shapes(fits: str, how: AtlasOptions) -> AbstractContextManager["Registered"
     collection = Collection(fits)
     if not collection.store.remote and read_manifest(collection.store) is None:
         if not Path(fits).is_dir():
-            raise OptionError(f"{fits} is not a folder", "give the folder that `meshmatch fit` made")
+            raise OptionError(
+                f"{fits} is not a folder", "give the folder that `meshmatch fit` made, or one of registered meshes"
+            )
         return registered_meshes(fits, how.leave_out or ())
     return collection.registered(how.poor, how.leave_out or ())
 

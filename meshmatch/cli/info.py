@@ -38,8 +38,8 @@ def info(
 ) -> None:
     """Describe a file: a shape, a map or a template.
 
-    Accepts all files that meshmatch reads or writes. For a shape, also lists its parts and what the repair before fitting
-    would change. Nothing is written.
+    For a shape, also lists its parts and what the repair before fitting would change. A .npz of an atlas, of blendshapes,
+    skin weights, registered shapes or landmarks is named, with its arrays. Nothing is written.
     """
     from meshmatch.maps import MAP_SUFFIXES
 

@@ -87,7 +87,7 @@ def measure(
         0.3,
         min=0.0,
         max=1.0,
-        help="A distance or an angle is missing if a landmark is below this confidence, a girth if a quarter of it is.",
+        help="A distance or an angle is missing if a landmark is below this confidence, a girth if over a quarter of it is.",
     ),
     table: Path | None = optional("FILE", "With several targets, also write one table of all: .csv."),
     picture: Picture = None,

@@ -56,7 +56,9 @@ def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], 
                 _transfer_all(verb, transfer, target, ending, rest, gather)
                 return
             if ending is not None:
-                raise OptionError("--format is for several targets", "end the name of the output in it")
+                raise OptionError(
+                    "--format is for several targets", "for one target, the suffix of --output chooses the format"
+                )
             if gather is not None and rest["table"] is not None:
                 raise OptionError("--table is for several targets", "name them, their folder, or a folder of fits")
             record = verb(target=target[0], **rest)

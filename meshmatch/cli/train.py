@@ -128,7 +128,12 @@ class TrainOptions(Options):
         None, min=0.0, help="Stop after this many minutes; the same command continues later."
     )
     points: int | None = Option(None, min=64, help="Points sampled per training scan. Default: the preset's.")
-    identities: int | None = Option(None, min=1, help="Number of generated people (default: 4096) or animals (1024).")
+    identities: int | None = Option(
+        None,
+        min=1,
+        help="Number of different people or animals among the generated shapes. Default: 4096 people for --kind human, "
+        "else 1024.",
+    )
     bodies: int | None = Option(
         None,
         min=0,

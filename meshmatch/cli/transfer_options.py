@@ -40,7 +40,7 @@ class MapOptions(PairOptions):
         "--map",
         metavar="MAP",
         help="Use this map from the first shape to the second, as `meshmatch match` writes it, or a folder of `meshmatch "
-        "fit` with the fits of both. Default: match the shapes.",
+        "fit` with the fits of both. Default: match the shapes, unless both have the same faces.",
     )
 
 

@@ -115,7 +115,8 @@ class Collection(FitsFolder):
         agree
             Whether to run the agreement.
         tell
-            Called with the record of each shape once it is judged.
+            Called with the record of each shape: with a model as soon as it is fitted, before the agreement; without one
+            when all are judged.
 
         Returns
         -------

@@ -1,8 +1,8 @@
 """Generated right hands, cut off between the wrist and the middle of the forearm.
 
-They are flat, relaxed, clenched, pointing, counting, pinching, or have independent fingers.
-Fingers bend and spread, and the thumb moves across the palm, within the limits of their joints. Of several random poses the
-one with the least overlap of fingers is used. Template frame: fingers up (y), palm to the front (z).
+They are flat, relaxed, clenched, pointing, counting, pinching, or have independent fingers. Fingers bend and spread, and
+the thumb moves across the palm, within the limits of their joints. Of several random poses the first with little overlap of
+fingers is used, else the one with the least. Template frame: fingers up (y), palm to the front (z).
 """
 
 from __future__ import annotations

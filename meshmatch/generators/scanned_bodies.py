@@ -105,7 +105,7 @@ def scanned_source(template: Template, scanned: Scanned, seed: int = 0, identiti
     """Source of random people on a template's vertices; `OptionError` if ``scanned`` was made for another template."""
     if len(scanned.corners) != template.shape.V:
         raise OptionError(
-            f"the scanned bodies were not made for template {template.name}", "make them for this template"
+            f"the scanned bodies were not made for template {template.name}", "give scanned_bodies this template"
         )
     return partial(sample_scanned, build_twisting_rig(scanned, np.array(template.shape.faces), identities, seed))
 

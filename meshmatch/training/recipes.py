@@ -188,8 +188,8 @@ def recipe_for(
 ) -> Recipe:
     """Choose the recipe for a folder of shapes, or for generated shapes.
 
-    Shapes are learned with correspondence if all of them are registered. A folder whose frame is known (few shapes, scaled
-    to equal areas) gets the recipe for small data; the paper's preset has no such recipe.
+    Shapes are learned with correspondence if all of them are registered. Fewer than a hundred registered shapes, prepared
+    at equal areas, get the recipe for small data; the paper's preset has no such recipe.
 
     Parameters
     ----------

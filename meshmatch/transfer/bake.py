@@ -197,7 +197,10 @@ def transfer_tiles(
 
 
 def contradicting_share(source: Shape, look: Appearance, target: Shape, back: VertexMap, atlas: Atlas) -> float:
-    """Share, by area, of the faces that share their place in the image with another one, whose colors differ from its."""
+    """Share of faces with other colors than the face at the same place in the image.
+
+    By area, of the faces that share their place in the image with another one.
+    """
     walker, look = _prepare_source(source, look)
     locator, sampler = TexelLocator(walker, target, back, atlas.uv * _COMPARE_SIZE), MaterialSampler(look, walker)
     face_at = draw_triangles(atlas.uv * _SEARCH_SIZE, _SEARCH_SIZE)[0]
