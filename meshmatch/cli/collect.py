@@ -99,7 +99,7 @@ def fit(
 
 
 def _report_distances(console: Console, records: "Sequence[Record]", model: str) -> None:
-    """Print the distance of the fits from the shapes; warn of copied files, and of files that seem to differ in unit."""
+    """Print the distance between fits without a model and their shapes; warn of copied files, and of differing units."""
     from meshmatch.collections.registered import mixed_units
 
     same = defaultdict(list)
