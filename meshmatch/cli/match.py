@@ -95,7 +95,7 @@ def register(
         "MESH", "Deform this mesh onto SHAPE, instead of the model's template; same as `register MESH --onto SHAPE`."
     ),
     dense: bool = Option(False, "--dense", help="Write the template at its full resolution."),
-    picture: Path | None = optional("PNG", "Draw the template over the shape, colored by distance."),
+    picture: Path | None = optional("PNG", "Draw the deformed mesh over the shape, colored by distance."),
 ) -> None:
     """Fit a template or another mesh to a shape.
 

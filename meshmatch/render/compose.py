@@ -92,7 +92,7 @@ def compose_match(
     here = position_colors(source, turns[0])
     there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
     panels = _colored_panels((source, target), (here, there))
-    return Composition(panels, caption="matched places in one color").rotated(turns)
+    return Composition(panels, caption="corresponding points in the same color").rotated(turns)
 
 
 def _colored_panels(shapes: Sequence[Shape], colors: Iterable[Float[Floats, "V C"]]) -> tuple[Panel, ...]:

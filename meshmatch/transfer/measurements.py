@@ -338,7 +338,7 @@ class _Surface:
         line = at_faces(self.shape, self.rows[cut[line_pieces[row]]], weights_at_points)
         if not lengths.sum() >= _MIN_SHARE * _girth(line.points)[0]:
             raise InputError(
-                f"measurement {name}: a quarter of the girth or more is missing, because the surface is open there"
+                f"measurement {name}: more than a quarter of the girth is missing, because the surface is open there"
             )
         return line, share
 

@@ -337,7 +337,7 @@ def test_transfers_and_measures_follow_fits(fits: Path, run: Run, tmp_path: Path
     assert np.allclose(np.load(tmp_path / "there.npy"), followed)
     assert run("evaluate", fits, climber, dancer, "--json").status == 0
     drawn = run("picture", climber, dancer, "--map", fits, "-o", tmp_path / "p.png", "--size", "80x60", "--no-names")
-    assert drawn.status == 0 and "matched places in one color" in drawn.err
+    assert drawn.status == 0 and "corresponding points in the same color" in drawn.err
     many = run(words[0], climber, fits, *words[3:5], "-o", tmp_path / "all", "--format", "npy", "--json")
     assert many.status == 0, many.err
     assert [(each["name"], each["map"]) for each in json.loads(many.out)["targets"]] == [

@@ -173,7 +173,7 @@ def test_what_labels_belong_to_can_be_said(drawn: Drawn) -> None:
 
 def test_a_map_as_colors(drawn: Drawn) -> None:
     drawn("a.ply c.ply --map map.npz")
-    assert "matched places in one color" in drawn.err
+    assert "corresponding points in the same color" in drawn.err
     one, other = drawn.panels
     assert np.asarray(other.colors)[np.load("truth.npy")] == pytest.approx(np.asarray(one.colors))
     assert drawn.names == ["a.ply", "c.ply"]

@@ -162,7 +162,7 @@ def test_a_girth_of_a_surface_that_is_open_there_is_refused() -> None:
         part = Shape(shape.verts, shape.faces[shape.verts[shape.faces][:, :, 0].min(axis=1) > least], "part")
         if is_open:
             with pytest.raises(
-                InputError, match="a quarter of the girth or more is missing, because the surface is open"
+                InputError, match="more than a quarter of the girth is missing, because the surface is open"
             ):
                 points_on(part, [AROUND])
         else:

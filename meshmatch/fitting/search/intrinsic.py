@@ -28,7 +28,7 @@ _N_FUNCTIONS = 50  # number of eigenfunctions
 _SMOOTHING_LENGTHS = 0.02, 0.08  # units of sqrt(area)
 _RELIEF_STEP = 0.001  # relief is rounded to multiples of this, so that a plane has none
 _NORMAL_WEIGHT = 0.1  # weight of unit normals against positions
-_MIN_AREA = 1e-12  # regularization for vertices whose triangles have no area
+_REGULARIZATION = 1e-12  # for vertices whose triangles have no area
 _N_LANDMARKS = 300  # evenly spread vertices that represent all
 _N_DISTANCES = 12  # number of distances in the area profile of an extremity
 # Shares of the diameter along the surface: an extremity is a maximum of the eccentricity with at least the first
@@ -87,7 +87,7 @@ class SimplifiedMesh:
         # about the length of an edge
         shortest = np.sqrt(2 * vertex_areas(self.verts, self.faces).sum() / len(self.faces))
         for length in np.maximum(_SMOOTHING_LENGTHS, shortest):
-            system = csc_matrix(mass + length**2 * stiffness + _MIN_AREA * identity(len(self.verts)))
+            system = csc_matrix(mass + length**2 * stiffness + _REGULARIZATION * identity(len(self.verts)))
             smooth = splu(system).solve(mass @ self.verts)
             heights = ((self.verts - smooth) * self.normals).sum(1)
             height, level = np.unique(np.round(heights / _RELIEF_STEP), return_inverse=True)

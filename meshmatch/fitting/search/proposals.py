@@ -172,7 +172,7 @@ def _distance_error(known: Float[Floats, "L L"], distances: Float[Floats, "U U"]
     return float(np.abs(known - distances[np.ix_(nearest, nearest)]).mean())
 
 
-def _orientation_preserved(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
+def _orientation_agreement(source: Intrinsic, target: Intrinsic, vertex: Int[Ints, " V"]) -> float:
     """Share of the mapped area that keeps its orientation minus the share that reverses it; -1 for a mirrored map."""
     mesh = target.mesh
     mapped = triangle_vectors(mesh.verts[vertex], source.mesh.faces)
@@ -327,7 +327,7 @@ def _ranks(table: Float[Floats, "T T"]) -> Float[Floats, "T T"]:
 def _select_maps(kind: Kind, source: Intrinsic, target: Intrinsic, maps: list[tuple[float, Ints]]) -> list[Proposal]:
     """The best maps that differ from each other, without those that reverse most triangles."""
     best = [vertex for _, vertex in sorted(maps, key=lambda each: each[0])]
-    chosen = [vertex for vertex in _distinct(target, best) if _orientation_preserved(source, target, vertex) >= 0]
+    chosen = [vertex for vertex in _distinct(target, best) if _orientation_agreement(source, target, vertex) >= 0]
     return [Proposal(kind, target.mesh.verts[vertex]) for vertex in chosen]
 
 
