@@ -46,6 +46,17 @@ def test_the_commands_of_results_are_here_or_in_a_commit_that_is_named(path: Pat
             assert module.main([*words[3:], "--help"]) == 0  # an unknown option would be refused
 
 
+def test_the_page_continues_the_ablations_with_the_options_of_their_file() -> None:
+    text = (DOCS / "paper.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    command = re.search(r"^    python -m (meshmatch\.experiments\.paper\.ablations --views .*)$", text, re.MULTILINE)
+    assert command
+    words = shlex.split(command[1])[1:]
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    used = json.loads((DOCS / "results" / "paper-ablations.json").read_text(encoding="utf-8"))["options"]
+    for option in ("views", "seeds", "repeated", "rounds", "steps", "shapes", "rows", "output"):
+        assert given[f"--{option}"] == str(used[option]), option
+
+
 def test_a_page_names_the_last_commit_of_a_command_that_is_gone(tmp_path: Path) -> None:
     (tmp_path / "results").mkdir()
     record = {"date": "d", "commit": "c", "machine": "m", "last_commit": "abc1234"}
