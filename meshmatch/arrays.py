@@ -162,6 +162,8 @@ def as_integers(values: ArrayLike, label: str) -> Int[Ints, ...]:
 
 def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) -> Floats:
     """Convert values to float64; `InputError` if they are not numbers, rows differ in length, or ``finite`` fails."""
+    if values is None:
+        raise InputError(f"{name} must be numbers, not None", "pass an array")
     try:
         array = np.asarray(to_numpy(values))
         if array.dtype.kind == "c":
@@ -170,5 +172,5 @@ def as_numbers(values: ArrayLike | TensorLike, name: str, finite: bool = False) 
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers ({error})", "pass an array, one row for each vertex") from error
     if finite and not np.isfinite(array).all():
-        raise InputError(f"{name} must be finite, but holds nan or infinite values")
+        raise InputError(f"{name} must be finite, but holds nan or infinite values", "leave them out or replace them")
     return array

@@ -21,6 +21,7 @@ from meshmatch.shapes.shape import LARGEST
 Outside = Literal["error", "mask", "nearest"]
 _N_NEAREST = 4  # nodes that move a point out of reach
 _SOFTENING = 1e-3  # units of a node's radius: the weight grows no further at smaller distances
+_USE_AUTOGRAD = "use torch.autograd, or transform a function of the vectors alone"
 _SUPPORT_MARGIN = 2.0  # factor on the required support, so that no point that is not masked fails because of rounding
 
 
@@ -217,7 +218,8 @@ class NodeField:
         if not (dense and fits and (len(shape) == 2 or B in (1, len(given)))):
             batch = "B" if self.points.ndim == 2 else B
             layout = "" if dense else f" in the layout {given.layout}"
-            raise InputError(f"vectors must be ({self.K}, C) or ({batch}, {self.K}, C), not {shape}{layout}")
+            what = f"vectors must be ({self.K}, C) or ({batch}, {self.K}, C), not {shape}{layout}"
+            raise InputError(what, "give one vector for each node, in the order of the nodes")
         kind = _precision([self.points, vectors], given if is_tensor(given) else values)
         if is_tensor(given) and not is_tensor(values):
             values = alike(values, given.double() if given.device.type != "mps" else given)
@@ -288,7 +290,8 @@ def node_field(
 
     At each point it is the affine motion that best fits the vectors of the nodes in reach; it reproduces affine motions
     exactly. Computed in float64. If points, nodes or radii are torch tensors, results are differentiable with respect to
-    them; the set of nodes that reach a point is treated as constant.
+    them by ``torch.autograd``; the set of nodes that reach a point is treated as constant. Transforms of ``torch.func``,
+    such as ``vmap`` and ``jacrev``, apply to functions of the vectors on a field that was made outside.
 
     Parameters
     ----------
@@ -390,7 +393,12 @@ def node_field(
 
 def _positions(values: Any, what: str, like: Any) -> Any:
     """Positions (N, 3) or (B, N, 3) in the type of `like`; `InputError` if they are not finite numbers of this shape."""
-    found = as_numbers(values, what, finite=True)
+    try:
+        found = as_numbers(values, what, finite=True)
+    except InputError as error:
+        if is_tensor(values) and "storage" in error.message:  # inside a transform, a tensor has no values
+            raise InputError(f"{what} cannot be read inside a transform of torch.func", _USE_AUTOGRAD) from error
+        raise
     if found.ndim not in (2, 3) or found.shape[-1] != 3 or 0 in found.shape:
         raise InputError(
             f"{what} must be an array of (N, 3) or (B, N, 3), not {found.shape}", "one position in each row"

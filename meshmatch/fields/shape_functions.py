@@ -136,7 +136,7 @@ def checked_radii(radius: ArrayLike, K: int) -> Float[Floats, " K"]:
     radii = as_numbers(radius, "the radius", finite=True)
     if radii.shape not in ((), (K,)) or not (radii > 0).all():
         what = f"the radius must be positive, one number or one for each of {K} nodes"
-        raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}")
+        raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}", "in the unit of the nodes")
     if not radii.max() < LARGEST:
         raise InputError("the radius is too large", "measure it in another unit")
     return np.broadcast_to(radii, (K,))

@@ -163,8 +163,26 @@ def test_badly_placed_nodes_are_told() -> None:
 ])  # fmt: skip
 def test_what_no_field_can_be_made_of_is_refused(changes: Any, error: type[MeshmatchError]) -> None:
     given = {"points": POINTS, "nodes": NODES, "radius": 0.8} | changes
-    with pytest.raises(error):
+    with pytest.raises(error) as caught:
         node_field(given.pop("points"), given.pop("nodes"), given.pop("radius"), **given)
+    assert caught.value.hint
+
+
+def test_a_missing_argument_is_not_called_nan() -> None:
+    for given in ((None, NODES, 0.8), (POINTS, None, 0.8), (POINTS, NODES, None)):
+        with pytest.raises(InputError, match="must be numbers, not None"):
+            node_field(*given)
+
+
+def test_transforms_of_torch_apply_to_the_vectors_alone() -> None:
+    nodes, vectors = torch.tensor(NODES), torch.tensor(VECTORS)
+    field = node_field(POINTS, NODES, 0.8)
+    both = torch.func.vmap(field.moved)(torch.stack([vectors, 2 * vectors]))
+    assert torch.allclose(both[1], field.moved(2 * vectors))
+    assert torch.func.jacrev(field.displacement)(vectors).shape == (len(POINTS), 3, len(NODES), 3)
+    with pytest.raises(InputError, match=r"points cannot be read inside a transform of torch\.func") as caught:
+        torch.func.grad(lambda points: node_field(points, nodes, 0.8).moved(vectors).sum())(torch.tensor(POINTS))
+    assert "autograd" in caught.value.hint
 
 
 def test_vectors_must_be_one_for_each_node() -> None:
@@ -172,8 +190,9 @@ def test_vectors_must_be_one_for_each_node() -> None:
     lists: list[Any] = [VECTORS[:-1], VECTORS[0], np.stack([VECTORS] * 3), VECTORS * np.nan, "words", VECTORS[:, :0]]
     tensors = [torch.zeros(3, 150, 3), torch.zeros(150, 3).to_sparse(), torch.zeros(0, 150, 3)]
     for wrong in (*lists, *tensors):
-        with pytest.raises(InputError, match="vectors"):
+        with pytest.raises(InputError, match="vectors") as caught:
             field.displacement(wrong)
+        assert caught.value.hint
     for of in (field.moved, field.deformation_gradient):
         with pytest.raises(InputError, match="3 components"):
             of(VECTORS[:, :2])
