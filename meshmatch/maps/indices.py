@@ -15,7 +15,8 @@ def check_range(index: Int[Ints, ...], target_vertices: int, label: str) -> None
     """Raise `InputError` if a vertex index is negative or not below ``target_vertices``."""
     if index.min() < 0:
         first = int(np.argmin(index))
-        raise InputError(f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0")
+        what = f"{label}: vertex {first} is matched to {int(index.min())}; indices start at 0"
+        raise InputError(what, "a map covers every vertex: give those without a match any vertex and confidence 0")
     if target_vertices != UNKNOWN and index.max() >= target_vertices:
         one_based = index.min() >= 1 and index.max() == target_vertices
         matched = f"{label}: vertex {int(np.argmax(index))} is matched to vertex {int(index.max())}"

@@ -85,8 +85,8 @@ class VertexMap(PickledFields):
     Raises
     ------
     InputError
-        An array has the wrong shape or type, an index lies outside the target, weights do not sum to 1, or the verdict or
-        an axis is unknown.
+        An array has the wrong shape or type, an index lies outside the target, weights do not sum to 1, faces are given
+        without weights or weights without faces, or the verdict or an axis is unknown.
 
     Examples
     --------
@@ -154,6 +154,10 @@ class VertexMap(PickledFields):
             raise InputError(f"{label}: face {int(faces.min())} does not exist")
         if not (weights >= -1e-9).all() or not np.allclose(weights.sum(axis=1), 1.0, atol=1e-6):
             raise InputError(f"{label}: barycentric weights must be 0 or more and sum to 1")
+        if self.barycentric is None and faces.max() >= 0:
+            raise InputError(f"{label} names faces without barycentric weights", "give both, or the index alone")
+        if self.face is None and (weights[:, 0] != 1).any():
+            raise InputError(f"{label} has barycentric weights without faces", "give both, or the index alone")
         if not (((trust >= 0) & (trust <= 1)).all() or np.isnan(trust).all()):
             raise InputError(f"{label}: confidence must lie in 0..1; leave it out where it is not known")
         return arrays
@@ -172,6 +176,10 @@ class VertexMap(PickledFields):
             (V_source,) the target vertex of each source vertex.
         rest
             The other attributes: face, barycentric, confidence, verdict, reasons.
+
+            For points within triangles, given by faces and weights, the index is usually the corner with the largest
+            weight: ``target.faces[face, weights.argmax(1)]``. Errors of `evaluate` are measured at ``index``; `points`,
+            `apply` and `functional` use faces and weights.
 
         Returns
         -------

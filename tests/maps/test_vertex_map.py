@@ -69,7 +69,7 @@ def test_arrays_are_its_own_and_read_only() -> None:
     [
         ({"index": np.array([0, 16])}, "has only 16", "another shape"),
         ({"index": np.array([1, 16])}, "has only 16", "1-based"),
-        ({"index": np.array([-1, 3])}, "start at 0", ""),
+        ({"index": np.array([-1, 3])}, "start at 0", "any vertex and confidence 0"),
         ({"index": np.zeros((2, 2), int)}, "list of", ""),
         ({"index": np.zeros(0, int)}, "list of", ""),
         ({"index": np.array([0.5, 1])}, "whole numbers", ""),
@@ -82,6 +82,8 @@ def test_arrays_are_its_own_and_read_only() -> None:
         ({"barycentric": np.ones((2, 3))}, "sum to 1", ""),
         ({"barycentric": np.array([[1, 0, 0], [2, -1, 0]])}, "sum to 1", ""),
         ({"barycentric": np.full((2, 3), np.nan)}, "sum to 1", ""),
+        ({"face": np.array([0, -1])}, "faces without barycentric weights", "give both"),
+        ({"barycentric": np.full((2, 3), 1 / 3)}, "barycentric weights without faces", "give both"),
         ({"confidence": np.array([0, 1.5])}, "0..1", ""),
         ({"confidence": np.array([0, np.nan])}, "0..1", ""),
         ({"confidence": np.array([0, 0x7F800001], np.uint32).view(np.float32)}, "0..1", ""),  # a nan that signals
@@ -105,7 +107,7 @@ def test_names_of_files_are_no_shapes(cube: Shape) -> None:
 
 def test_a_face_that_the_target_lacks_is_refused() -> None:
     with pytest.raises(InputError, match=r"face 18, but its target has only 18"):
-        VertexMap.between(A, B, np.zeros(A.V, int), face=np.full(A.V, B.F))
+        VertexMap.between(A, B, np.zeros(A.V, int), face=np.full(A.V, B.F), barycentric=np.eye(3)[np.zeros(A.V, int)])
 
 
 def test_points_lie_where_face_and_weights_say() -> None:
