@@ -43,7 +43,9 @@ class Frame(ShortRepr, PickledFields):
         scale = as_numbers(self.scale, "a frame's scale")
         if rotation.shape != (3, 3) or center.shape != (3,):
             raise InputError(f"a frame needs a (3, 3) rotation and a (3,) center, not {rotation.shape}, {center.shape}")
-        if not (scale.ndim == 0 and np.isfinite(scale) and scale > 0 and np.isfinite(center).all()):
+        if not np.isfinite(center).all():
+            raise InputError("a frame's center must be finite, but holds nan or infinite values")
+        if not (scale.ndim == 0 and np.isfinite(scale) and scale > 0):
             raise InputError(
                 f"a frame's scale must be positive and finite, not {self.scale}", "does the shape have a size?"
             )

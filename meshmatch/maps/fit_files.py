@@ -119,12 +119,12 @@ def read_fit(path: str | Path, template: Template) -> StoredFit:
     """Read a fit of this template; `InputError` if the file is missing, damaged, of another schema or template."""
     path = Path(path)
     about, more = read_fit_header(path)
+    if about["template_hash"] != template.hash:
+        wrong = f"{path.name} is a fit of another template ({about['template_hash']}, not {template.hash})"
+        raise InputError(wrong, "use the model that made it")
     try:
         with safe_open(str(path), framework="np") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
-        if about["template_hash"] != template.hash:
-            wrong = f"{path.name} is a fit of another template ({about['template_hash']}, not {template.hash})"
-            raise InputError(wrong, "use the model that made it")
         V = template.shape.V
         fit = Fit(
             frame=Frame(float(about["scale"]), arrays["rotation"], arrays["center"]),
@@ -146,7 +146,7 @@ def read_fit(path: str | Path, template: Template) -> StoredFit:
         places = _places(arrays, about, fit)
         fit = fit if places is None else PlacedFit.of(fit, places)
         return StoredFit(fit, _samples(arrays, about), _shape(arrays, about), more)
-    except (SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
+    except (InputError, SafetensorError, KeyError, TypeError, ValueError, OverflowError, OSError) as error:
         raise InputError(f"{path.name} is damaged: {error}", _HINT) from error
 
 

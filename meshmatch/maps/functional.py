@@ -79,7 +79,9 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
     """
     found = as_shape(shape)
     name = found.name or "the shape"
-    if not isinstance(K, int | np.integer) or isinstance(K, bool) or not 1 <= K <= found.V - 2:
+    if not isinstance(K, int | np.integer) or isinstance(K, bool):
+        raise InputError(f"the number of eigenfunctions must be an integer, not {K!r}", f"ask for 1 to {found.V - 2}")
+    if not 1 <= K <= found.V - 2:
         raise InputError(f"{name} with {found.V} vertices has no {K} eigenfunctions", f"ask for 1 to {found.V - 2}")
     if not found.valid.all():
         raise InputError(f"{name} has vertices without a position", "export it again without them")

@@ -39,6 +39,7 @@ _MIN_SAMPLES, _MAX_SAMPLES = 1024, 4096  # per shape
 _ALL_SAMPLES = 200_000  # per folder
 _MAX_CANDIDATES = 40  # maximum number of candidates for the medoid
 _MAX_TILT = 30.0  # degrees: registered shapes rotated by less have the same orientation; set by hand
+_SAME_TEMPLATE = "prepare it again, with `meshmatch prepare --template` and the options of the other folder"
 _LANDMARKS_HINT = "either one vertex a line (-1: missing), or x, y and z of a point on each line"
 ARRAYS = ("points", "normals", "landmarks", "template_landmarks")
 
@@ -361,7 +362,7 @@ def _read_arrays(
     except (OSError, ValueError, KeyError, StopIteration, SafetensorError) as error:
         raise _not_prepared(folder) from error
     if facts.get("template") != template.hash:
-        raise InputError(f"{folder} was prepared for another template", "prepare it again")
+        raise InputError(f"{folder} was prepared for another template", _SAME_TEMPLATE)
     return facts, found
 
 

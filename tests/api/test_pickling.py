@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
 from meshmatch.api.fits import load_fit, save_fit
@@ -152,10 +153,15 @@ def test_files_of_fits_are_refused_in_words(folder: Path, result: MatchResult, t
         load_fit(path, "human")
     arrays, words = load_file(path), read_fit_header(path)
     header = {"fit": json.dumps({"schema": 1, "fit": words[0], "more": words[1]})}
-    for name, bad in {"shape_verts": np.full((9, 3), np.nan), "shape_faces": np.full((4, 3), 10**6)}.items():
+    damaged: dict[str, NDArray[Any]] = {
+        **{"shape_verts": np.full((9, 3), np.nan), "shape_faces": np.full((4, 3), 10**6)},
+        **{"rotation": 2 * np.eye(3), "center": np.full(3, np.nan)},
+    }
+    for name, bad in damaged.items():
         save_file(arrays | {name: bad}, path, header)
-        with pytest.raises(InputError):
+        with pytest.raises(InputError, match=r"a\.safetensors is damaged") as caught:
             load_fit(path, folder)
+        assert "fit the shape again" in caught.value.hint
 
 
 def test_what_a_shape_derives_stays_behind(cube: Shape) -> None:

@@ -37,19 +37,19 @@ def test_frame_laws(scale: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "rotation", "center"),
+    ("scale", "rotation", "center", "words"),
     [
-        (0.0, np.eye(3), np.zeros(3)),
-        (-1.0, np.eye(3), np.zeros(3)),
-        (np.nan, np.eye(3), np.zeros(3)),
-        (1.0, 2 * np.eye(3), np.zeros(3)),
-        (1.0, 1e200 * np.eye(3), np.zeros(3)),
-        (1.0, np.eye(4), np.zeros(3)),
-        (1.0, np.eye(3), [0, 0, np.inf]),
+        (0.0, np.eye(3), np.zeros(3), "scale must be positive"),
+        (-1.0, np.eye(3), np.zeros(3), "scale must be positive"),
+        (np.nan, np.eye(3), np.zeros(3), "scale must be positive"),
+        (1.0, 2 * np.eye(3), np.zeros(3), "rotation must be orthonormal"),
+        (1.0, 1e200 * np.eye(3), np.zeros(3), "rotation must be orthonormal"),
+        (1.0, np.eye(4), np.zeros(3), "rotation and a"),
+        (1.0, np.eye(3), [0, 0, np.inf], "center must be finite"),
     ],
 )
-def test_frame_refuses(scale: float, rotation: np.ndarray, center: np.ndarray) -> None:
-    with pytest.raises(InputError, match="frame"):
+def test_frame_refuses(scale: float, rotation: np.ndarray, center: np.ndarray, words: str) -> None:
+    with pytest.raises(InputError, match=f"frame.*{words}"):
         Frame(scale, rotation, center)
 
 

@@ -1,6 +1,7 @@
 """Laplacian eigenfunctions, functional maps both ways, and what is measured of maps besides errors."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,8 +76,10 @@ def test_what_has_no_eigenfunctions_or_masses_is_told(cube: Shape) -> None:
     assert str(cube.V - 2) in caught.value.hint
     with pytest.raises(InputError, match="without a position"):
         laplacian_basis(Shape.with_invalid(np.vstack([cube.verts, [[np.nan] * 3]]), cube.faces, "holed"), 3)
-    with pytest.raises(InputError, match="no True eigenfunctions"):
-        laplacian_basis(cube, True)
+    wrong: tuple[Any, ...] = (True, "5", 5.0, None)
+    for K in wrong:
+        with pytest.raises(InputError, match=f"must be an integer, not {K!r}"):
+            laplacian_basis(cube, K)
     with pytest.raises(InputError, match="no surface"):
         laplacian_basis(np.arange(60.0)[:, None] * [1.0, 0.0, 0.0], 3)
     for mass in (np.ones(3), np.zeros(cube.V), np.full(cube.V, np.nan)):

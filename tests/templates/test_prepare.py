@@ -210,8 +210,9 @@ def test_labels_are_of_one_shape_and_for_parts(folder: Path, tmp_path: Path) -> 
 def test_a_folder_of_another_template_or_none_is_refused(folder: Path, tmp_path: Path) -> None:
     made = prepared(folder, tmp_path / "out", FEW)
     other = prepared(folder, tmp_path / "other", NodeConfig(strategy="uniform", K=61, radius=0.3))
-    with pytest.raises(InputError, match="prepared for another template"):
+    with pytest.raises(InputError, match="prepared for another template") as caught:
         read_registered(tmp_path / "out", other.template)
+    assert "`meshmatch prepare --template`" in caught.value.hint
     with pytest.raises(InputError, match="not a prepared folder") as caught:
         read_registered(tmp_path, made.template)
     assert "meshmatch prepare" in caught.value.hint
