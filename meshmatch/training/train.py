@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -18,14 +19,14 @@ import torch
 from torch import Tensor
 
 from meshmatch.arrays import Float, Int, Ints
-from meshmatch.errors import InputError, OptionError, TemplateError
+from meshmatch.errors import InputError, ModelError, OptionError, TemplateError
 from meshmatch.fields.field import Field
 from meshmatch.fields.shape_functions import has_nodes, shape_functions
 from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.generator import Source
 from meshmatch.generators.kinds import Kind
 from meshmatch.geometry.kernels import Kernel
-from meshmatch.models.card import ModelCard, check_name, write_card
+from meshmatch.models.card import ModelCard, check_name, read_card, write_card
 from meshmatch.models.checkpoint import save_weights
 from meshmatch.models.deformer import Deformer
 from meshmatch.models.inference import training_device
@@ -255,6 +256,7 @@ def train_model(
 
     if trainer.rank == 0:
         metrics = Metrics(output / METRICS, trainer)
+        metrics.best = min(metrics.best, _stored_best(output / BEST, trainer.step))
         tensorboard_report = curves(output / CURVES, trainer.step) if tensorboard else None
         report = combine_reports(metrics, tensorboard_report, report, lambda now: export_if_best(now.validation))
     trainer.seconds += aligned.total_seconds
@@ -268,6 +270,18 @@ def train_model(
             export_if_best(score)
         export(trainer, template, output, recipe, facts, score)
     return output
+
+
+def _stored_best(folder: Path, step: int) -> float:
+    """Validation error of the model in ``folder`` if it is of ``step`` or earlier, infinity otherwise.
+
+    It may be of the step at which a run stopped, which has no line in `METRICS`.
+    """
+    with suppress(ModelError, KeyError, TypeError):
+        card = read_card(folder / CARD)
+        if card.steps <= step:
+            return float(card.metrics["validation"]["distance"])
+    return float("inf")
 
 
 def align(

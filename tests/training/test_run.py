@@ -181,6 +181,30 @@ def test_the_best_model_so_far_is_kept_beside_the_last(prepared: Path, tmp_path:
     assert [row["validation"] for row in rows if "validation" in row] == [0.3, 0.2, 0.25]
 
 
+def test_a_best_model_of_the_step_where_a_run_stopped_is_kept(
+    prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = iter([0.3, 0.1, 0.2, 0.2, 0.2])  # of step 10 and of the stop; then of steps 20, 30 and the end
+    stopped = False
+
+    def measured(*_: object) -> float:
+        nonlocal stopped
+        stopped = True
+        return next(scores)
+
+    monkeypatch.setattr("meshmatch.training.train.held_out_error", measured)
+    run, is_true = Trainer.run, Trainer.any_process
+    monkeypatch.setattr(Trainer, "run", lambda *args, **more: run(*args, **more, every=1))
+    monkeypatch.setattr(Trainer, "any_process", lambda self, flag: is_true(self, flag) or stopped)
+    recipe = SMALL.changed(steps=30, minutes=60.0)
+    folder = trained(prepared, tmp_path / "model", recipe)
+    assert load_model(folder / "best").card.metrics["validation"]["distance"] == 0.1
+    monkeypatch.setattr(Trainer, "any_process", is_true)
+    assert load_model(trained(prepared, folder, recipe)).card.steps == 30
+    best = load_model(folder / "best").card
+    assert best.steps < 20 and best.metrics["validation"]["distance"] == 0.1
+
+
 def test_another_folder_can_be_measured_on(prepared: Path, tmp_path: Path) -> None:
     usual = trained(prepared, tmp_path / "usual")
     template = read_template(prepared / "template.safetensors")
