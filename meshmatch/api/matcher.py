@@ -276,8 +276,8 @@ class Matcher:
         agree
             First refine both fits jointly, as `match` does, so that the template stretches alike in both. The map is more
             accurate, and its confidence reflects where the fits disagreed. Without it, the fits are composed as they are,
-            in a tenth of the time. Fits of a `Collection` are always composed: they were refined jointly before, and do
-            not contain the shapes any more.
+            in about three quarters of the time. Fits of a `Collection` are always composed: they were refined jointly
+            before, and do not contain the shapes any more.
 
         Returns
         -------
