@@ -75,7 +75,29 @@ class TrainedModel:
         -------
         TrainedModel
             The model.
+
+        Raises
+        ------
+        ModelError
+            The network is none of a model, is of another template, or has weights that are nan or infinite.
         """
+        from meshmatch.models.deformer import Deformer
+
+        if not isinstance(network, Deformer):
+            raise ModelError(
+                f"{type(network).__name__} is not the network of a model", "change a copy of model.network"
+            )
+        _check_template(card, template, "use the template of the model that the card is from")
+        if len(network.nodes) != template.K:
+            raise ModelError(
+                f"the network moves {len(network.nodes)} nodes, but the template has {template.K}",
+                "use its own template",
+            )
+        for name, value in network.state_dict().items():
+            if not value.isfinite().all():
+                raise ModelError(
+                    f"the weights {name} of the network are nan or infinite", "train again at a lower rate"
+                )
         inference: Network = network
         if not network.config.in_torch:
             weights = {name: value.numpy(force=True) for name, value in network.state_dict().items()}
@@ -158,6 +180,13 @@ class TrainedModel:
         return has_nodes(self.inference.config.field)
 
 
+def _check_template(card: ModelCard, template: Template, hint: str) -> None:
+    """Raise `ModelError` if the template is not the one on the card."""
+    if template.hash != card.template_hash or template.K != card.field["nodes"]:
+        both = f"{card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes"
+        raise ModelError(f"model {card.name} was trained with another template ({both})", hint)
+
+
 @derived
 def torch_network(model: TrainedModel, device: str = "cpu") -> Deformer:
     """The network of a model in torch, see `meshmatch.models.inference.in_torch`."""
@@ -181,10 +210,7 @@ def trained_model(
     that the model was trained with; `TemplateError` if the template's file is damaged.
     """
     template = load_template(template_file)
-    if template.hash != card.template_hash or template.K != card.field["nodes"]:
-        both = f"{card.template_hash}, {card.field['nodes']} nodes; here {template.hash}, {template.K} nodes"
-        problem = f"model {card.name} was trained with another template ({both})"
-        raise ModelError(problem, "fetch or add the model again")
+    _check_template(card, template, "fetch or add the model again")
     if card.field["kernel"] not in KERNELS:
         problem = f"model {card.name} has the kernel {card.field['kernel']!r}, not {' or '.join(KERNELS)}"
         raise ModelError(problem, "it may need a newer meshmatch: update it")

@@ -30,6 +30,7 @@ from meshmatch.models.network import PAPER, NetworkConfig, weight_shapes
 from meshmatch.models.registry import built_in_folder, load_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.training.train import build_deformer
+from tests.fitting.eggs import egg_model
 from tests.training.small import NETWORK, POINTS, SCAN, UPRIGHT, bent_eggs, egg_template
 
 CONFIGS = pytest.mark.parametrize("config", [NETWORK, POINTS], ids=["basis", "point"])
@@ -385,3 +386,24 @@ def test_another_template_beside_the_weights_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no model 'humna'") as caught:
         load_model("humna")
     assert "human" in caught.value.hint
+
+
+def test_a_model_in_memory_must_be_of_one_piece() -> None:
+    model = egg_model()
+    made = TrainedModel.of(model.card, model.template, deepcopy(model.network))
+    points = torch.randn(1, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.2
+    assert torch.equal(made.network(points), model.network(points))
+    spoiled = deepcopy(model.network)
+    with torch.no_grad():
+        next(spoiled.decoder.parameters()).fill_(float("nan"))
+    fewer = replace(model.template, nodes=model.template.nodes[:-1])
+    card = replace(model.card, template_hash=fewer.hash, field={**model.card.field, "nodes": fewer.K})
+    for words, make in (
+        ("Linear is not the network", lambda: TrainedModel.of(model.card, model.template, torch.nn.Linear(3, 3))),  # type: ignore[arg-type]
+        ("another template", lambda: TrainedModel.of(model.card, fewer, model.network)),
+        (f"moves {fewer.K + 1} nodes", lambda: TrainedModel.of(card, fewer, model.network)),
+        ("nan or infinite", lambda: TrainedModel.of(model.card, model.template, spoiled)),
+    ):
+        with pytest.raises(ModelError, match=words) as caught:
+            make()
+        assert caught.value.hint
