@@ -53,7 +53,7 @@ from meshmatch.training.load_data import (
     with_validation,
 )
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
-from meshmatch.training.losses import LossPoints, SurfacePoints, held_out_error
+from meshmatch.training.losses import LossPoints, Objective, SurfacePoints, held_out_error
 from meshmatch.training.recipe_files import recipe_record
 from meshmatch.training.recipes import Recipe, fine_tuning, recipe_for, small_data
 from meshmatch.training.records import CURVES, METRICS, Metrics, Report, check_curves, combine_reports, curves
@@ -199,8 +199,10 @@ def train_model(
     A source is validated on shapes drawn from ``unseen``, by default from the source itself. ``digest`` identifies the
     shapes, see `TrainingData`.
 
-    `InputError` if there is only one shape; `OptionError` if the start model has another template, network or kernel.
+    `InputError` if there is only one shape; `OptionError` if the loss is not for such shapes, or the start model has another
+    template, network or kernel.
     """
+    _check_loss(recipe.train.loss, registered=not isinstance(source, ShapeSamples))
     checkpoint = (output := Path(output)) / CHECKPOINT
     name = facts.name or output.resolve().name
     facts = replace(facts, name=name, category=facts.category or name)
@@ -270,6 +272,15 @@ def train_model(
             export_if_best(score)
         export(trainer, template, output, recipe, facts, score)
     return output
+
+
+def _check_loss(loss: Objective, registered: bool) -> None:
+    """Raise `OptionError` if the loss is not for such shapes."""
+    if loss.needs_correspondence != registered:
+        what = (
+            f"the loss {type(loss).__name__} is for shapes {'without' if registered else 'with'} known correspondence"
+        )
+        raise OptionError(what, f"derive it from {'CorrespondenceLoss' if registered else 'ChamferLoss'}")
 
 
 def _stored_best(folder: Path, step: int) -> float:

@@ -31,12 +31,12 @@ from meshmatch.models.registry import load_model, verify_model
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.make import NodeConfig
-from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered
+from meshmatch.templates.prepared_folder import RegisteredShapes, read_registered, read_samples
 from meshmatch.templates.template import Template, read_template
 from meshmatch.training.datasets import registered_source
 from meshmatch.training.load_data import known_template
 from meshmatch.training.loop import StepReport, TrainConfig, Trainer
-from meshmatch.training.losses import CorrespondenceLoss
+from meshmatch.training.losses import ChamferLoss, CorrespondenceLoss
 from meshmatch.training.recipe_files import read_recipe
 from meshmatch.training.recipes import Recipe, default, fine_tuning, paper, people, recipe_for
 from meshmatch.training.records import curves
@@ -159,6 +159,19 @@ def test_what_no_card_could_hold_is_refused_before_the_work(prepared: Path, tmp_
         with pytest.raises(ModelError, match=words):
             train_model(template, source, tmp_path / "other", SMALL, facts)
     assert not (tmp_path / "other").exists()
+
+
+def test_a_loss_for_other_shapes_is_refused_before_the_work(prepared: Path, tmp_path: Path) -> None:
+    template = read_template(prepared / "template.safetensors")
+    unregistered = replace(SMALL, train=replace(SMALL.train, loss=ChamferLoss()))
+    samples = read_samples(prepared, template)
+    for source, recipe, words in (
+        (egg_source(prepared, template), unregistered, "without known correspondence"),
+        (samples, SMALL, "with known correspondence"),
+    ):
+        with pytest.raises(OptionError, match=words) as caught:
+            train_model(template, source, tmp_path / "model", recipe, CardFacts("eggs"))
+        assert "Loss" in caught.value.hint and not (tmp_path / "model").exists()
 
 
 def test_a_model_without_words_is_called_as_its_folder(prepared: Path, tmp_path: Path) -> None:
