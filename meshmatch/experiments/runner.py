@@ -120,7 +120,9 @@ def command(run: Callable[..., Report]) -> Callable[..., int]:
         called.__signature__ = signature.replace(parameters=[*signature.parameters.values(), save_parameter])  # type: ignore[attr-defined]
         called.__annotations__ = {**run.__annotations__, "save": Save}
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-        app.command(help=module.__doc__)(called)
+        # Each item of a list becomes a paragraph; otherwise all are joined into one.
+        paragraphs = (module.__doc__ or "").replace("\n- ", "\n\n- ").replace("\n  ", "\n")
+        app.command(help=paragraphs)(called)
         try:
             typer.main.get_command(app)(args=arguments, prog_name=program)
         except SystemExit as stop:

@@ -1,6 +1,7 @@
 """The runner: options, tables, finished work that is kept, the JSON line and the exit status."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,16 @@ def main(count: int, seed: Seed = 0) -> Report:
         raise InputError("thirteen [shapes]", "take another number")
     record = {"rows": ROWS, "path": Path("x"), "array": np.arange(count)}
     return Report(record, [table("A table", ROWS, {"set": "set", "mean": "mean:.2f", "part": "share:.0%"})], ["done"])
+
+
+def test_lists_of_a_docstring_stay_lists_in_the_help(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        sys.modules[__name__], "__doc__", "Sets.\n\n- SMAL_r: animals\n  of SMAL.\n- TOPKIDS: children.\n"
+    )
+    assert main(["--help"]) == 0
+    assert "  - SMAL_r: animals of SMAL.\n\n  - TOPKIDS: children.\n" in capsys.readouterr().out
 
 
 def test_a_command_prints_tables_notes_and_one_line_last(capsys: pytest.CaptureFixture[str]) -> None:
