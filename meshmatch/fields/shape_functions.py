@@ -139,6 +139,8 @@ def checked_radii(radius: ArrayLike, K: int) -> Float[Floats, " K"]:
         raise InputError(f"{what}, not {radii if radii.ndim == 0 else radii.shape}", "in the unit of the nodes")
     if not radii.max() < LARGEST:
         raise InputError("the radius is too large", "measure it in another unit")
+    if not radii.min() > 1 / LARGEST:
+        raise InputError("the radius is too small", "measure it in another unit")
     return np.broadcast_to(radii, (K,))
 
 

@@ -158,6 +158,7 @@ def test_badly_placed_nodes_are_told() -> None:
     ({"nodes": np.zeros((2, 3, 4))}, InputError), ({"nodes": [[1, 2], [3]]}, InputError), ({"radius": -1.0}, InputError),
     ({"radius": np.ones(3)}, InputError), ({"radius": torch.tensor(torch.nan)}, InputError), ({"radius": None}, InputError),
     ({"points": np.zeros((2, 4, 3)), "nodes": np.stack([NODES] * 3)}, InputError),
+    ({"radius": 1e200}, InputError), ({"points": POINTS * 1e-170, "nodes": NODES * 1e-170, "radius": 1e-170}, InputError),
     ({"points": POINTS * 1e200}, InputError), ({"points": np.zeros((0, 5, 3))}, InputError),
     ({"kernel": "gaussian"}, OptionError), ({"kernel": ["smooth"]}, MeshmatchError), ({"outside": "drop"}, OptionError),
 ])  # fmt: skip
