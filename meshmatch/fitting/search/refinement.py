@@ -200,10 +200,10 @@ def choose(
 def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidate) -> Candidate:
     """Return the fit with one limb bent to a region that it leaves uncovered, if that is better and leaves none.
 
-    ``chosen`` is the candidate from which ``fit`` was refined. The limb is bent in it, and the result is refined again,
-    because the refined fit has already deformed a limb that is in the wrong place. Fits with several uncovered regions are
-    left alone, as several limbs are wrong: on two people, each limb that was moved let another one go astray. So are
-    clouds, whose noise hides uncovered regions.
+    ``chosen`` is the candidate from which ``fit`` was refined. Limbs are bent in both: in the refined fit a limb that is in
+    the wrong place is deformed already, but the others are closer to theirs. The likeliest are refined. Fits with several
+    uncovered regions are left alone, as several limbs are wrong: on two people, each limb that was moved let another one go
+    astray. So are clouds, whose noise hides uncovered regions.
     """
     task, limbs = comparison.task, limbs_of(comparison.task.model)
     if not limbs.bends or not task.samples.signed:
@@ -212,12 +212,12 @@ def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidat
     regions = uncovered_regions(local, task.system.surface(fit.vectors))
     if len(regions) != 1:
         return fit
-    reaching = limbs.reaching(local, comparison.average_similar(chosen).vectors, regions[0])
-    if reaching is None:
-        return fit
-    bent = comparison.refined(replace(chosen, vectors=reaching), in_full=True)
-    better = comparison.score(bent, False) < SETTINGS.bent_margin * comparison.score(fit, False)
-    return bent if better and not uncovered_regions(local, task.system.surface(bent.vectors)) else fit
+    starts = [comparison.average_similar(chosen).vectors, fit.vectors]
+    tried = limbs.reaching(local, starts, regions[0])
+    refined = parallel_map(lambda vectors: comparison.refined(replace(chosen, vectors=vectors), in_full=True), tried)
+    complete = [each for each in refined if not uncovered_regions(local, task.system.surface(each.vectors))]
+    bent = min(complete, key=lambda each: comparison.score(each, False), default=fit)
+    return bent if comparison.score(bent, False) < SETTINGS.bent_margin * comparison.score(fit, False) else fit
 
 
 def _screen(candidates: list[Candidate], comparison: WholeComparison, progress: Progress) -> list[Candidate]:
