@@ -149,14 +149,14 @@ def as_array(values: Any, name: str, hint: str = "") -> NDArray[Any]:
 
 
 @np.errstate(invalid="ignore")  # rounding nan; nan is refused
-def as_integers(values: ArrayLike, label: str) -> Int[Ints, ...]:
+def as_integers(values: ArrayLike, label: str, hint: str = "") -> Int[Ints, ...]:
     """Convert integers, which may be given as floats, to int64; `InputError` for anything else."""
-    array = as_array(values, label)
+    array = as_array(values, label, hint)
     is_whole = array.dtype.kind == "f" and np.array_equal(array, np.round(array))
     if is_whole and (np.abs(array.astype(np.float64)) < 2**53).all():
         return array.astype(np.int64)  # MATLAB's numbers are doubles
     if array.dtype.kind not in "iu":
-        raise InputError(f"{label} must be whole numbers, not {array.dtype}")
+        raise InputError(f"{label} must be whole numbers, not {array.dtype}", hint)
     return np.array(array, dtype=np.int64)
 
 

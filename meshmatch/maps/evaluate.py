@@ -16,6 +16,7 @@ from meshmatch.arrays import (
     PickledFields,
     ShortRepr,
     as_array,
+    as_integers,
     as_numbers,
     set_read_only,
     table_html,
@@ -236,10 +237,8 @@ def map_errors(
     Pairs with a -1 have no counterpart, and are left out with a warning.
     `InputError` if the lists are not integers, differ in length, or name a vertex that does not exist.
     """
-    index, a, b = (as_array(ids, "the truth", _TRUTH_HINT) for ids in (index, source_points, target_points))
-    for ids in (a, b):
-        if ids.dtype.kind not in "iu":
-            raise InputError(f"the truth must be numbers of vertices, not {ids.dtype}", "integers, counted from 0")
+    index = as_array(index, "the map")
+    a, b = (as_integers(ids, "the truth", "vertices, counted from 0") for ids in (source_points, target_points))
     if a.shape != b.shape or a.ndim != 1 or not a.size:
         raise InputError(f"the truth has {a.shape} vertices of the source and {b.shape} of the target", _TRUTH_HINT)
     known = (a != -1) & (b != -1)

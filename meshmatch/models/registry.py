@@ -96,10 +96,13 @@ def locate_model(name: str | Path) -> Path:
         return folder
     try:
         return _registered(text)
-    except ModelError:
-        if os.path.isdir(folder) and ((folder / CARD).is_file() or is_implicit(folder)):
+    except ModelError as error:
+        if not os.path.isdir(folder):
+            raise
+        if (folder / CARD).is_file() or is_implicit(folder):
             return folder
-        raise
+        what = f"{error.message}, and the folder of this name has no {CARD}"
+        raise ModelError(what, "train a model into it first, or see `meshmatch models list`") from error
 
 
 def check_model(name: str | Path) -> None:

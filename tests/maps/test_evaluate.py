@@ -36,6 +36,9 @@ def test_errors_by_hand() -> None:
     geodesics = GeodesicDistances(sheet)
     assert map_errors(index, np.arange(9), np.arange(9), geodesics).values.tolist() == [1.0] + [0.0] * 8
     assert map_errors(index, [0, 1], [2, 0], geodesics).values.tolist() == [0.0, 0.5]
+    assert map_errors(index, np.array([0.0, 1.0]), np.array([2.0, 0.0]), geodesics).values.tolist() == [0.0, 0.5]
+    with pytest.raises(InputError, match="whole numbers"):
+        map_errors(index, [0.5, 1], [2, 0], geodesics)
     for bad in (([0, 1], [0]), ([0, 9], [0, 1]), ([0, 1], [0, 9]), ([-1], [0]), ([], [])):
         with pytest.raises(InputError):
             map_errors(index, np.array(bad[0], int), np.array(bad[1], int), geodesics)

@@ -74,6 +74,9 @@ def test_a_model_is_found_by_name_or_by_folder(blob: Path, tmp_path: Path, monke
     assert find_model("human")[1].name == "human"  # the name wins
     assert find_model("./human")[1].name == "mine"
     assert find_model(Path("human"))[1].name == "mine"
+    (blob.parent / "zebra").mkdir()
+    with pytest.raises(ModelError, match="no model 'zebra', and the folder of this name has no card"):
+        find_model("zebra")
 
 
 @pytest.mark.parametrize("wrong", ["humna", "Human", "human "])
