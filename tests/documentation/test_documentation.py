@@ -72,3 +72,12 @@ def test_the_paper_page_names_what_is_in_its_files() -> None:
     named = re.findall(r"`(\w+(?:/\w+)+\.py)` `(\w+)", text)
     assert len(named) > 10
     assert [each for each in named if each[1] not in (ROOT / "meshmatch" / each[0]).read_text(encoding="utf-8")] == []
+
+
+def test_each_version_of_the_changelog_is_as_short_as_a_release_needs() -> None:
+    law = (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    [limit] = re.findall(r"section of the changelog: at most (\d+) words", law)
+    sections = re.split(r"^## ", (ROOT / "docs" / "changelog.md").read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    assert meshmatch.__version__ in [section.split()[0] for section in sections]
+    too_long = {section.split()[0]: len(section.split()) for section in sections if len(section.split()) > int(limit)}
+    assert too_long == {}
