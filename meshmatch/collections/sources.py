@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
 from meshmatch import blender
-from meshmatch.collections.setting import LEFT_OUT, Record, Source
+from meshmatch.collections.setting import FAILED, LEFT_OUT, Record, Source
 from meshmatch.collections.stores import Store, is_url
 from meshmatch.errors import InputError, warn
 from meshmatch.outputs import as_path, plain_text
@@ -25,6 +25,12 @@ _COMPANIONS = {
     *(".txt", ".md", ".rst", ".html", ".pdf", ".svg", ".doc", ".docx", ".odt", ".rtf", ".log", ".ini", ".db"),
     *(".py", ".r", ".rdata", ".ipynb", ".sh"),
 }  # suffixes of files that are often kept with shapes but are not shapes
+_UNREADABLE_SHAPES = {
+    *(".3dm", ".3ds", ".3mf", ".abc", ".amf", ".asc", ".byu", ".c4d", ".ctm", ".drc", ".dxf", ".e57", ".gii", ".gts"),
+    *(".iges", ".igs", ".las", ".laz", ".lwo", ".ma", ".max", ".mb", ".mesh", ".msh", ".mz3", ".pmd", ".pmx", ".ptx"),
+    *(".skp", ".sldprt", ".spz", ".step", ".stp", ".vrml", ".wrl", ".wrz", ".x3d", ".ztl", ".zpr"),
+}  # suffixes of formats of shapes that `load_shape` does not read
+_UNREADABLE, _UNKNOWN = "shapes in formats that are not read", "files of unknown format"
 _TEXT_FILES = {"readme", "license", "licence", "copying", "changelog", "makefile", "authors", "notice"}
 _MAX_NAMES = 5  # files listed in a warning
 _WILDCARDS = "*?["
@@ -36,9 +42,10 @@ def find_sources(
     """Find the shapes of files, folders, patterns and URLs of folders, sorted by name; and list what was left out.
 
     A shape of a folder is named by its path in the folder, without the suffix; any other shape by the name of its file.
-    Files of unknown formats are left out with a warning, as are files that need Blender in a folder with other shapes.
-    Images, tables, links to folders, and .npy arrays next to other shapes are left out without a warning. All of these
-    have records, except files that share the name of a shape. Files in the ``output`` folder are ignored.
+    Shapes in formats that cannot be read have failed, as have files that need Blender in a folder with other shapes; a
+    warning names them. Files of unknown formats are left out with a warning. Images, tables, links to folders, and .npy
+    arrays next to other shapes are left out without a warning. All of these have records, except files that share the name
+    of a shape. Files in the ``output`` folder are ignored.
 
     `InputError` if there is no shape, or two shapes have the same name.
     """
@@ -104,16 +111,13 @@ def _add_sources(given: str | Path, output: Store | None, found: list[Source], l
         candidates = [
             file for file in names if not output_prefix or not f"{folder.location}/{file}".startswith(output_prefix)
         ]
-        _warn_left_out(
-            folder.location, "files of unknown format", filter(_is_unknown, candidates), left_out, f"{folder.location}/"
-        )
         shapes = [file for file in candidates if suffix_of(file) in SUFFIXES]
         preferred = [file for file in shapes if suffix_of(file) not in blender.SUFFIXES] or shapes
         selected = [file for file in preferred if suffix_of(file) != ".npy"] or preferred
         known = {file.with_name(stem_of(file)) for file in (*selected, *preferred)}
         projects = [file for file in shapes if file.with_name(stem_of(file)) not in known]
-        _warn_left_out(folder.location, "Blender files next to other shapes", projects, left_out, f"{folder.location}/")
-        left_out += _skipped_records(candidates, selected, projects, f"{folder.location}/")
+        skipped = _skipped_files(candidates, [*selected, *projects], selected)
+        left_out += _records_with_warning(folder.location, skipped, projects, f"{folder.location}/")
         why = "a link to a folder, which is not followed"
         left_out += [Record(link, f"{folder.location}/{link}", LEFT_OUT, reasons=why) for link in folder.folder_links()]
         found += [Source(str(file.with_name(stem_of(file))), folder, str(file)) for file in selected]
@@ -121,40 +125,49 @@ def _add_sources(given: str | Path, output: Store | None, found: list[Source], l
     files = [path]
     if not path.exists() and any(mark in str(given) for mark in _WILDCARDS):
         files = [Path(match) for match in glob.glob(str(path), recursive=True)]
-        unknown = (file for file in files if _is_unknown(file) and file.is_file())
-        _warn_left_out(str(given), "files of unknown format", unknown, left_out)
         matches, files = files, [file for file in files if suffix_of(file) in SUFFIXES]
-        left_out += _skipped_records([file for file in matches if file.is_file()], files, [], "")
+        skipped = _skipped_files([file for file in matches if file.is_file()], files, files)
+        left_out += _records_with_warning(str(given), skipped, [], "")
     found += [Source(stem_of(file), Store.of(file.parent), file.name) for file in files]
 
 
 def _is_unknown(file: PurePath) -> bool:
     """Whether a file's format is unknown; a file without suffix counts, as slices of a scanner often have none."""
-    return suffix_of(file) not in (*SUFFIXES, *_COMPANIONS) if file.suffix else file.name.lower() not in _TEXT_FILES
+    known = (*SUFFIXES, *_COMPANIONS, *_UNREADABLE_SHAPES)
+    return suffix_of(file) not in known if file.suffix else file.name.lower() not in _TEXT_FILES
 
 
-def _skipped_records(
-    files: Sequence[PurePath], selected: Sequence[PurePath], recorded: Sequence[PurePath], folder: str
-) -> list[Record]:
-    """Records of skipped files, but for those ``recorded`` already and those that share the name of a shape."""
-    known, owners = {*selected, *recorded}, {file.with_name(stem_of(file)) for file in selected}
+def _skipped_files(
+    files: Sequence[PurePath], known: Sequence[PurePath], selected: Sequence[PurePath]
+) -> list[PurePath]:
+    """Files that are not ``known``, without those that share the name of a selected shape."""
+    expected, owners = set(known), {file.with_name(stem_of(file)) for file in selected}
     found = []
     for file in files:
         words = file.name.split(".")
         belongs = any(file.with_name(".".join(words[:count])) in owners for count in range(1, len(words)))
-        if file not in known and not belongs and not _is_unknown(file):
-            is_array = suffix_of(file) == ".npy"
-            why = "an array next to shapes" if is_array else "not a format of shapes"
-            found.append(Record(str(file), f"{folder}{file}", LEFT_OUT, reasons=why))
+        if file not in expected and not belongs:
+            found.append(file)
     return found
 
 
-def _warn_left_out(given: str, why: str, files: Iterable[PurePath], left_out: list[Record], folder: str = "") -> None:
-    """Warn that files of a folder or a pattern are left out, and append a record of each."""
-    names = [str(file) for file in files]
-    if names:
-        shown = ", ".join(names[:_MAX_NAMES]) + (
-            f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-        )
-        warn(f"{given}: {why} are left out: {plain_text(shown)}")
-        left_out += [Record(name, f"{folder}{name}", reasons=f"left out: {why}") for name in names]
+def _records_with_warning(
+    given: str, skipped: Sequence[PurePath], projects: Sequence[PurePath], folder: str
+) -> list[Record]:
+    """Records of skipped files and of Blender files of a folder or a pattern, with a warning for unexpected formats."""
+    unreadable = [file for file in skipped if suffix_of(file) in _UNREADABLE_SHAPES]
+    unknown = [file for file in skipped if _is_unknown(file)]
+    warned = {*unreadable, *unknown}
+    failed = {"Blender files next to other shapes": projects, _UNREADABLE: unreadable}
+    found = []
+    for why, files in (failed | {_UNKNOWN: unknown}).items():
+        if names := [str(file) for file in files]:
+            more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+            warn(f"{given}: {why} are left out: {plain_text(', '.join(names[:_MAX_NAMES]) + more)}")
+            verdict = FAILED if why in failed else LEFT_OUT
+            found += [Record(name, f"{folder}{name}", verdict, reasons=f"left out: {why}") for name in names]
+    for file in skipped:
+        if file not in warned:
+            why = "an array next to shapes" if suffix_of(file) == ".npy" else "not a format of shapes"
+            found.append(Record(str(file), f"{folder}{file}", LEFT_OUT, reasons=why))
+    return found

@@ -508,16 +508,16 @@ def test_a_collection_has_the_shapes_of_before_as_long_as_their_files_are_there(
 
 
 def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
-    """And a file that no reader knows has a row, too."""
+    """And a shape in a format that no reader knows has a row, too."""
     shutil.copy(SAMPLES / "dancer.ply", tmp_path)
     (tmp_path / "scan.wrl").write_text("#VRML")
-    with pytest.warns(MeshmatchWarning, match=r"unknown format are left out: scan\.wrl"):
+    with pytest.warns(MeshmatchWarning, match=r"formats that are not read are left out: scan\.wrl"):
         made = meshmatch.Collection(tmp_path / "fits", workers=1).fit(tmp_path, model="quadruped")
     record, other = made.records
     assert (record.verdict, record.reasons.split("; ")[0]) == ("poor", "it is of another kind: human")
     with (tmp_path / "fits" / "fits.csv").open(newline="") as table:
         rows = list(csv.DictReader(table))
-    told = "scan.wrl", str(tmp_path / "scan.wrl"), "failed", "left out: files of unknown format"
+    told = "scan.wrl", str(tmp_path / "scan.wrl"), "failed", "left out: shapes in formats that are not read"
     assert [row["name"] for row in rows] == ["dancer", "scan.wrl"] and made.counts["failed"] == 1
     assert (
         tuple(rows[1][name] for name in ("name", "file", "verdict", "reasons"))
@@ -549,9 +549,15 @@ def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.Capture
     assert set(meshmatch.Transfers(meshmatch.transfer_landmarks, scans / "dancer.ply", fits).files) == {"climber"}
     for number in range(3):
         (scans / f"{number}.png").write_bytes(b"no shape")
-    assert main(command) == 0
+    (scans / "more.bak").write_bytes(b"no shape")
+    assert main([*command, "--strict"]) == 0
     err = capsys.readouterr().err
-    assert "they are not shapes: 3 .png, 1 without a suffix, 1 .docx, 1 .npy, 1 .tif; see" in err
+    assert "files of unknown format are left out: more.bak" in err
+    assert "they are not shapes: 3 .png, 1 .bak, 1 without a suffix, 1 .docx, 1 .npy, 1 .tif; see" in err
+    assert "more.bak" not in file_table(Store.of(fits))  # not a frame of a sequence
+    (scans / "scan.wrl").write_text("#VRML")
+    assert main([*command, "--strict"]) == 1
+    assert "2 good, 1 failed" in capsys.readouterr().err
     _, left_out = find_sources([f"{scans}/*.[pt]*"])
     assert sorted(Path(each.file).name for each in left_out) == ["0.png", "1.png", "2.png", "stack.tif"]
 
