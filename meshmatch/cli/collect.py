@@ -1,7 +1,8 @@
 """``meshmatch fit`` and ``map``: fit the shapes of a collection, and map any two of them."""
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -80,10 +81,14 @@ def fit(
             shapes, model=how.model, config=how.configs()[0], only=how.only or (), without=how.without or (),
             sequence=sequence, agree=agree, tell=report,
         )  # fmt: skip
-    counts = made.counts
-    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    chosen = f" (model {made.model})" if how.model == AUTO else ""
-    console.say(f"wrote {sum(record.fitted for record in made.records)} fits to {output}{chosen}: {verdicts}")
+    counts, verdicts = made.counts, _summarize_verdicts(made.counts)
+    for where in dict.fromkeys([output, *made.elsewhere.values()]):
+        records = [each for each in made.records if made.elsewhere.get(each.name, output) == where]
+        written = sum(each.fitted for each in records)
+        model = made.model if where == output else meshmatch.Collection(where).model
+        chosen = f" (model {model})" if how.model == AUTO else ""
+        found = _summarize_verdicts(replace(made, records=tuple(records)).counts)
+        console.say(f"wrote {written} fit{'s' * (written != 1)} to {where}{chosen}: {found}")
     if others := [record.name for record in made.records if record.verdict == LEFT_OUT]:
         console.say(f"ignored, as they are not shapes: {_summarize_files(others)}; see {output}/fits.csv")
     console.say(*elsewhere_messages(made.elsewhere))
@@ -96,6 +101,10 @@ def fit(
         print_json({"output": output, "model": made.model, "seed": how.seed, "agreed": made.agreed, "verdicts": counts})
     if strict and (counts["poor"] or counts[FAILED]):
         raise PoorFit(f"not every fit is to be trusted: {verdicts}", f"see {output}/fits.csv")
+
+
+def _summarize_verdicts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
 
 
 def _report_distances(console: Console, records: "Sequence[Record]", model: str) -> None:

@@ -76,6 +76,15 @@ def test_what_is_said(fits: Path, run: Run) -> None:
     assert strict.status == 1 and "not every fit is to be trusted: 2 good, 1 failed" in strict.err
 
 
+def test_fits_of_each_kind_are_counted_under_their_model(run: Run, tmp_path: Path) -> None:
+    shapes, fits = [SAMPLES / f"{name}.ply" for name in ("dancer", "calf", "fox")], tmp_path / "fits"
+    answer = run("fit", *shapes, "-o", fits, "--jobs", "1", "--refine", "none", "--alone", "--json")
+    assert [line.partition("): ")[0] for line in answer.err.splitlines() if line.startswith("wrote")] == [
+        f"wrote 2 fits to {fits} (model quadruped", f"wrote 1 fit to {fits / 'human'} (model human"
+    ]  # fmt: skip
+    assert sum(json.loads(answer.out)["verdicts"].values()) == 3
+
+
 def test_lengths_have_one_unit_or_none_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     fit = Record("a", "a.ply", "good", distance=0.2, furthest=3.0, scale=90.0)
     _report_distances(Console(False), [fit, replace(fit, name="b", scale=110.0)], "none")
