@@ -31,7 +31,8 @@ def info(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A shape, a map, a fit, a template or landmarks; or the folder of a collection, an atlas or a model.",
+            help="A shape, a map, a fit, a template or landmarks; or the folder of a collection, an atlas, a model or "
+            "prepared shapes.",
         ),
     ],
     json: options.Json = False,
@@ -61,7 +62,7 @@ def info(
     for key, value in record.items():
         if key == "unit_if_a_person" and value is None:
             continue
-        values = value if key in ("repair", "reasons", "meshes", "materials") else [value]  # a line each
+        values = value if key in ("repair", "reasons", "meshes", "materials", "notes") else [value]  # a line each
         if key == "largest_parts":
             values = _part_lines(value, record["parts"])
         if key == "flat_bases":
@@ -205,7 +206,7 @@ def _landmarks(file: Path) -> Json:
 
 
 def _folder(file: Path) -> Json:
-    """Describe a folder: the fits of a collection, an atlas, or a model."""
+    """Describe a folder: the fits of a collection, an atlas, a model, or what `prepare` made."""
     import csv
 
     from meshmatch.collections.select_setting import read_manifest
@@ -227,8 +228,25 @@ def _folder(file: Path) -> Json:
         return {"kind": "model"} | {
             name: getattr(card, name) for name in ("name", "category", "data", "licence", "created")
         }
-    hint = "give the name of a file, of a model's folder, or of one that `meshmatch fit` or `atlas` made"
+    if (file / "prepared.json").is_file():
+        return _prepared(file)
+    if (file / "template.safetensors").is_file():  # of a single shape `prepare` makes a template only
+        return _template(file / "template.safetensors")
+    hint = "give the name of a file, of a model's folder, or of one that `meshmatch fit`, `prepare` or `atlas` made"
     raise InputError(f"{file} is a folder", hint)
+
+
+def _prepared(folder: Path) -> Json:
+    """Describe a prepared folder: its shapes, and the template."""
+    from meshmatch.templates.prepared_folder import prepared_facts
+
+    facts, template = prepared_facts(folder), _template(folder / "template.safetensors")
+    lists = {key: found if isinstance(found := facts.get(key), list) else [] for key in ("names", "mirrored", "notes")}
+    about: Json = {"kind": "prepared folder", "shapes": len(lists["names"]), "mirrored": len(lists["mirrored"])}
+    about |= {name: facts.get(name) for name in ("registered", "align", "scale", "landmarks")}
+    about |= {"template": template["name"]}
+    about |= {f"template_{name}": template[name] for name in ("vertices", "faces", "nodes")}
+    return about | {"notes": [str(note) for note in lists["notes"]]}
 
 
 def _tensors(file: Path) -> Json:

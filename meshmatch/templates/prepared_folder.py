@@ -312,12 +312,17 @@ def read_registered(folder: str | Path, template: Template) -> Float[Floats32, "
     return shapes
 
 
-def check_prepared(folder: str | Path) -> None:
-    """Raise `InputError` unless `prepare` made the folder."""
+def prepared_facts(folder: str | Path) -> dict[str, Any]:
+    """Read what ``prepared.json`` says of a prepared folder; `InputError` if the folder is not one."""
     try:
-        _read_facts(as_path(folder))
+        return _read_facts(folder)
     except (OSError, ValueError) as error:
         raise _not_prepared(folder) from error
+
+
+def check_prepared(folder: str | Path) -> None:
+    """Raise `InputError` unless `prepare` made the folder."""
+    prepared_facts(as_path(folder))
 
 
 def is_registered(folder: str | Path) -> bool:

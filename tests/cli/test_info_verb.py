@@ -147,7 +147,7 @@ def test_what_is_no_map_is_called_what_it_is(run: Run, tmp_path: Path) -> None:
 
 
 def test_folders_are_called_what_they_are(run: Run, tmp_path: Path) -> None:
-    assert "fit` or `atlas` made" in run("info", tmp_path).err
+    assert "fit`, `prepare` or `atlas` made" in run("info", tmp_path).err
     words = ("schema", "template", "model", "only", "without", "sequence", "fit")
     (tmp_path / "collection.json").write_text(
         json.dumps(dict.fromkeys(words, "") | {"schema": SCHEMA, "model": "hand"})
@@ -158,6 +158,24 @@ def test_folders_are_called_what_they_are(run: Run, tmp_path: Path) -> None:
     (tmp_path / "atlas").mkdir()
     (tmp_path / "atlas" / "atlas.npz").touch()
     assert record(run, tmp_path / "atlas")["kind"] == "atlas"
+
+
+def test_a_prepared_folder(run: Run, tmp_path: Path, sphere: Shape) -> None:
+    (tmp_path / "shapes").mkdir()
+    for number in range(3):
+        save_shape(tmp_path / "shapes" / f"{number}.ply", Shape(sphere.verts * (1, 1, 1 + 0.1 * number), sphere.faces))
+    sizes = ("--nodes", "60", "--radius", "0.3")
+    assert run("prepare", tmp_path / "shapes", "-o", tmp_path / "made", *sizes).status == 0
+    found = record(run, tmp_path / "made")
+    assert (found["kind"], found["shapes"], found["registered"]) == ("prepared folder", 3, True)
+    assert (found["align"], found["scale"], found["landmarks"]) == ("near", "area", 0)
+    assert (found["template_vertices"], found["template_nodes"]) == (sphere.V, 60)
+    shown = run("info", tmp_path / "made").out
+    assert "prepared folder" in shown and "registered" in shown
+    assert run("prepare", tmp_path / "shapes" / "0.ply", "-o", tmp_path / "one", *sizes).status == 0
+    assert record(run, tmp_path / "one")["kind"] == "template"
+    (tmp_path / "made" / "prepared.json").write_text("{")
+    assert "is not a prepared folder" in run("info", tmp_path / "made").err
 
 
 def test_a_fit_and_a_model(run: Run, tmp_path: Path) -> None:
