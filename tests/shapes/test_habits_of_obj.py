@@ -255,6 +255,10 @@ def polypaint(colors: np.ndarray, mask: str = "ff") -> str:
         VERTS + polypaint(SEEN, "00") + FACES,
         VERTS + FACES + polypaint(SEEN).upper().replace("#MRGB", "#MRGB  ").replace("\n", "\r\n"),
         VERTS + colored("vc {R} {G} {B}") + FACES,
+        VERTS + colored("  vc {R} {G} {B}") + FACES,
+        VERTS + colored("\tvc\t{R} {G} {B}").replace("\n", "\r\n") + FACES,
+        colored("vc {R} {G} {B}") + VERTS + FACES,
+        (VERTS + polypaint(SEEN) + FACES).replace("\n", "\n  "),
     ],
 )
 def test_vertex_colors_of_obj(tmp_path: Path, text: str) -> None:

@@ -34,6 +34,7 @@ _CONTINUATION = re.compile(rb"\\[ \t]*\n(?![ \t]*(?:" + _ENTRIES + rb")[ \t])", 
 _COMMENT = re.compile(rb"(?:^|[ \t])#")
 SPACED_SLASH = re.compile(rb"(?<![ \t])[ \t]++(//?)[ \t]*+")
 _MIXED_CORNERS = re.compile(rb"/[ \t]++[^\s/]++(?!/)")
+_COLOR_LINE = re.compile(rb"^[ \t]*+vc[ \t]", re.MULTILINE)
 _POLYPAINT = re.compile(rb"(?:[0-9a-fA-F]{8})+")
 
 
@@ -114,7 +115,7 @@ def _colors(name: str, data: bytes, values: Floats, counts: Ints) -> Floats | No
             return None
         masked = np.frombuffer(bytes.fromhex(b"".join(rows).decode()), np.uint8).reshape(-1, 4)
         return _fill_colors(name, "polypaint (#MRGB)", masked[:, 1:] / 255.0, len(counts))
-    if b"\nvc " in data:
+    if b"vc" in data and _COLOR_LINE.search(data):
         [(text, lines)] = formats.lines_starting_with(formats.without_comments(data), b"vc")
         counts_per_line = words_per_line(text)
         if len(counts_per_line) == len(lines) and len(counts_per_line) and counts_per_line.min() >= 3:
