@@ -6,6 +6,7 @@ Uses the standard library only, so that the command line can list the settings w
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import inf
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -125,7 +126,10 @@ def geometric_between(low: float, high: float, share: float) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class LatentRefineConfig:
-    """The paper's weights L1 to L3, steps and learning rate for the search over codes."""
+    """The paper's weights L1 to L3, steps and learning rate for the search over codes.
+
+    `OptionError` for steps or points below 1, a rate that is not positive, or a negative weight.
+    """
 
     steps: int = 2000
     rate: float = 1e-3
@@ -133,6 +137,15 @@ class LatentRefineConfig:
     volume: float = 1e-4
     arap: float = 1e-3
     points: int = 3000
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "points"):
+            _check_count(name, getattr(self, name), 1)
+        for name in ("rate", "chamfer", "volume", "arap"):
+            value = getattr(self, name)
+            if not _is_number(value) or not (0 < value < inf or (value == 0 and name != "rate")):
+                least = "above 0" if name == "rate" else "of 0 or more"
+                raise OptionError(f"{name} cannot be {value!r}", f"give a number {least}, or leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,10 +242,8 @@ class FitConfig:
         if self.mirror not in (None, *MIRRORINGS):
             raise OptionError(f"mirror cannot be {self.mirror!r}", f"choose one of {', '.join(MIRRORINGS)}")
         for name, least in _MINIMUMS.items():
-            value = getattr(self, name)
-            if not isinstance(value, Integral) or value < least:
-                raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
-        if not isinstance(self.tilt, Real) or not 0 <= self.tilt <= 180:
+            _check_count(name, getattr(self, name), least)
+        if not _is_number(self.tilt) or not 0 <= self.tilt <= 180:
             raise OptionError(f"tilt cannot be {self.tilt!r}", "give degrees from 0 to 180, or leave it out")
         kinds = {"device": str, "nodes": NodeRefineConfig, "latent": LatentRefineConfig}
         for name, kind in kinds.items():
@@ -317,6 +328,17 @@ class FitConfig:
         if roughness <= 0:
             return self
         return replace(self, samples=round(self.samples * (1 + roughness)), nodes=self.nodes.for_noise(roughness))
+
+
+def _check_count(name: str, value: object, least: int) -> None:
+    """Raise `OptionError` unless a value is an integer of at least ``least``; a bool is none."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value is a real number; a bool is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def axis_of(name: str) -> tuple[int, float]:

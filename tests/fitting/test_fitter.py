@@ -87,11 +87,25 @@ def test_the_refinements_are_three(fits: dict[Refine, Fit]) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"tilt": "a"}, {"tilt": float("nan")}, {"device": None}, {"nodes": 3}, {"latent": None}]
+    "wrong",
+    [
+        *({"tilt": "a"}, {"tilt": float("nan")}, {"tilt": True}, {"device": None}, {"nodes": 3}, {"latent": None}),
+        *({"samples": True}, {"seed": False}, {"hypotheses": 2.0}, {"copies": 0}),
+    ],
 )
 def test_values_of_another_type_are_refused_at_once(wrong: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=f"{next(iter(wrong))} cannot be "):
         FitConfig(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"steps": True}, {"points": 1.5}, {"rate": 0}, {"rate": float("inf")}, {"arap": -1e-3}]
+)
+def test_a_search_over_codes_needs_steps_points_and_a_rate(wrong: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=f"{next(iter(wrong))} cannot be ") as caught:
+        LatentRefineConfig(**wrong)
+    assert "or leave it out" in caught.value.hint
+    assert LatentRefineConfig(volume=0, arap=0, steps=np.int64(3)).steps == 3  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("refine", REFINEMENTS)
