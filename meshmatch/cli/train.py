@@ -156,7 +156,9 @@ class TrainOptions(Options):
         help="Share of the --characters with cartoon proportions. Default: 0.15.",
     )
     poses: Path | None = optional("FILE", "Poses to mix with the sampled ones: .npz, .json or .csv (docs/formats.md).")
-    pose_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies with a pose from --poses.")
+    pose_share: float = Option(
+        0.5, min=0.0, max=1.0, help="Share of the bodies with a pose from --poses, of those not from --mhr."
+    )
     mhr: Path | None = optional(
         "FOLDER",
         "Mix in bodies of Meta's Momentum Human Rig, whose shapes were learned from scans: lod3.fbx and compact_v6_1.model "

@@ -37,9 +37,10 @@ MAX_BODIES = 20_000
 class Bodies:
     """Options of generated human bodies, on the vertices of ``template`` and of ``identities`` different people.
 
-    ``poses`` are given poses that replace a share of the random ones. ``characters`` is the share of bodies with clothes,
-    other proportions or built of parts, and ``stylised`` the share of these with the proportions of cartoons; all other
-    bodies are naked. ``bodies`` is the size of a fixed pool of bodies to train on; 0 generates new ones in every step.
+    ``poses`` are given poses that replace a share of the random ones, except of scanned bodies. ``characters`` is the share
+    of bodies with clothes, other proportions or built of parts, and ``stylised`` the share of these with the proportions of
+    cartoons; all other bodies are naked. ``bodies`` is the size of a fixed pool of bodies to train on; 0 generates new ones
+    in every step.
     ``scanned`` replaces a share of all bodies with naked ones whose shapes were learned from scans, in random poses.
     """
 
@@ -73,6 +74,7 @@ class Bodies:
             words += f", {self.poses.share:.0%} of them in {self.poses.P} poses of {self.poses.name}"
         if self.scanned is not None:
             source = "naked bodies of the Momentum Human Rig (Meta, Apache-2.0), its shapes learned from scans"
+            source += "" if self.poses is None else ", in sampled poses only"
             words = f"{1 - self.scanned.share:.0%} {words}; {self.scanned.share:.0%} {source}"
         return words
 

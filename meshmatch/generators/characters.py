@@ -57,7 +57,10 @@ class CharacterConfig:
 
 
 def people_source(template: Template, bodies: Bodies, seed: int = 0, progress: Progress | None = None) -> Source:
-    """Source of people on a human template's vertices; errors as `meshmatch.generators.bodies.human_source`."""
+    """Source of people on a human template's vertices; errors as `meshmatch.generators.bodies.human_source`.
+
+    Scanned bodies are in random poses only: given poses are rotations from the rest pose of the other bodies' rig.
+    """
     if bodies.scanned is not None:
         others = people_source(template, replace(bodies, scanned=None), seed, progress)
         return mix_sources(others, scanned_source(template, bodies.scanned, seed), bodies.scanned.share)

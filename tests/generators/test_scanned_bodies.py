@@ -16,6 +16,7 @@ from meshmatch.generators.bodies import Bodies
 from meshmatch.generators.characters import people_source
 from meshmatch.generators.generator import Source, mix_sources
 from meshmatch.generators.momentum_rig import MomentumRig, Scanned, read_momentum_rig
+from meshmatch.generators.pose_files import GivenPoses
 from meshmatch.generators.rig import forward_kinematics
 from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.generators.scanned_bodies import (
@@ -167,6 +168,10 @@ def test_people_are_a_mixture_and_the_card_says_so(rig: MomentumRig, monkeypatch
     under = Scanned(rig, np.zeros((template.shape.V, 3), int), np.tile([1.0, 0, 0], (template.shape.V, 1)), 0.25)
     bodies = Bodies(characters=0.5, scanned=under)
     assert "75% 4096 generated bodies" in bodies.words and "25% naked bodies of the Momentum Human Rig" in bodies.words
+    posed = replace(bodies, poses=GivenPoses(("head",), np.zeros((3, 1, 3), np.float32), 0.5, "dance.csv"))
+    generated, scanned = posed.words.split("; 25%")
+    assert "50% of them in 3 poses of dance.csv" in generated and scanned.endswith(", in sampled poses only")
+    assert "sampled poses only" not in bodies.words
     asked: list[Any] = []
 
     def naked(*given: Any) -> Source:
