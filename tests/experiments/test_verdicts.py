@@ -86,6 +86,25 @@ def test_a_target_in_pieces_is_cut_again(cases: Cases) -> None:
     assert seen[3] != seen[4] == targets[3].shape.F and targets[3].has.sum() < cases.template.shape.V
 
 
+def test_a_target_whose_cuts_all_fail_ends_with_the_error(cases: Cases) -> None:
+    seen: list[int] = []
+
+    class Refusing:
+        def fit(self, shape: Shape) -> str:
+            seen.append(shape.F)
+            if len(seen) > 1000:
+                raise RuntimeError("no end")
+            raise InputError("2 large parts far apart")
+
+    with pytest.raises(InputError, match="far apart"):
+        verdicts.target_of(cases, Refusing(), 3)  # type: ignore[arg-type]
+    assert 1 < len(set(seen)) == len(seen) < 100
+    seen.clear()
+    with pytest.raises(InputError, match="far apart"):
+        verdicts.target_of(cases, Refusing(), 0)  # type: ignore[arg-type]
+    assert len(seen) == 1
+
+
 def case_of(family: str, verdict: str, error: float) -> dict[str, object]:
     return {"family": family, "verdict": verdict, "error": error, "seconds": 2.0}
 

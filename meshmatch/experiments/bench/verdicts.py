@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import date
 from functools import cache, partial
@@ -64,6 +63,7 @@ _TOTAL_COLUMNS |= {
     "of these good or fair": "right_and_believed:d",
 }
 _RIDGE = 0.002
+_MAX_CUTS = 20  # cuts of a target to try; nearly all can be fitted
 GROUPS = {"tuned": [name for name in FAMILIES if name not in KEPT], "kept": list(KEPT), "all": list(FAMILIES)}
 
 
@@ -78,18 +78,26 @@ class Target:
 
 
 def target_of(others: Cases, matcher: Matcher, number: int) -> Target:
-    """Make a target from another person than the cases; every fourth is cut, again if the cut shape cannot be fitted."""
+    """Make a target from another person than the cases; every fourth is cut, again if the cut shape cannot be fitted.
+
+    `InputError` of the last fit after `_MAX_CUTS` cuts, or of the only fit of a whole shape.
+    """
     rng, cut = np.random.default_rng([others.seed, number]), number % 4 == 3
     places, faces = others.bodies[number], others.template.shape.faces
     whole, every = Shape(places, faces, f"target {number}"), np.arange(len(places))
+    cuts = 0
     while True:
+        cuts += cut
         shape, kept = (
             faces_between(whole, every, direction(rng), rng.uniform(0.15, 0.5), 1.0) if cut else (whole, every)
         )
-        with suppress(InputError) if cut else nullcontext():
-            has = np.zeros(len(places), bool)
-            has[kept] = True
+        has = np.zeros(len(places), bool)
+        has[kept] = True
+        try:
             return Target(shape, matcher.fit(shape), places, has)
+        except InputError:
+            if not cut or cuts == _MAX_CUTS:
+                raise
 
 
 def measure_case(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]:
