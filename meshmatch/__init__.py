@@ -6,6 +6,7 @@ pages are listed in docs/reference.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 __version__ = "0.3.0"
@@ -131,7 +132,20 @@ _PUBLIC = {
 }
 _MODULE_OF = {name: f"meshmatch.{module}" for module, names in _PUBLIC.items() for name in names.split()}
 
+_NEED_TORCH = ("meshmatch.implicit.", "meshmatch.training.")
+
+
+def _has_torch() -> bool:
+    try:
+        return find_spec("torch") is not None
+    except ImportError:
+        return False
+
+
+# Without torch only the names that do not need it, so that `import *`, `help` and `inspect` work.
 __all__ = ["__version__", *sorted(_MODULE_OF)]  # noqa: PLE0604  (names come from __getattr__)
+if not _has_torch():
+    __all__ = [name for name in __all__ if not _MODULE_OF.get(name, "").startswith(_NEED_TORCH)]
 
 
 def __getattr__(name: str) -> object:
@@ -149,8 +163,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """All public names, but without torch only those that do not need it, so that `help` and `inspect` work."""
-    from importlib.util import find_spec
-
-    unavailable = () if find_spec("torch") else ("meshmatch.implicit.", "meshmatch.training.")
-    return sorted(name for name in __all__ if not _MODULE_OF.get(name, "").startswith(unavailable))
+    return sorted(__all__)
