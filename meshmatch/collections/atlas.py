@@ -339,7 +339,7 @@ class Atlas(ShortRepr, PickledFields):
         Parameters
         ----------
         names
-            Names of shapes.
+            Names of shapes, or one name.
 
         Returns
         -------
@@ -352,6 +352,7 @@ class Atlas(ShortRepr, PickledFields):
             The atlas has no shape of one of the names.
         """
         known = {name: k for k, name in enumerate(self.names)}
+        names = [names] if isinstance(names, str) else names
         for name in names:
             if name not in known:
                 some = ", ".join(self.names[:5]) + ", ..." * (len(known) > 5)
@@ -372,9 +373,9 @@ class Atlas(ShortRepr, PickledFields):
         Parameters
         ----------
         first
-            Names of the first group.
+            Names of the first group, two or more.
         second
-            Names of the second group.
+            Names of the second group, two or more.
         kind
             What to test at vertices: displacement along the mean's normal ("normal") or in any direction ("hotelling").
         permutations
@@ -394,10 +395,11 @@ class Atlas(ShortRepr, PickledFields):
         OptionError
             A group of fewer than two shapes, too few shapes for the statistic, or no permutations.
         """
-        both = set(first) & set(second)
+        groups = [dict.fromkeys([names] if isinstance(names, str) else names) for names in (first, second)]
+        both = groups[0].keys() & groups[1].keys()
         if both:
             raise InputError(f"{min(both)!r} is in both groups", "a shape is in one of them")
-        rows = [self.rows(tuple(dict.fromkeys(names))) for names in (first, second)]
+        rows = [self.rows(tuple(names)) for names in groups]
         chosen = np.concatenate(rows)
         in_second = np.arange(len(chosen)) >= len(rows[0])
         return compare_groups(

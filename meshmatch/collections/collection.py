@@ -130,7 +130,8 @@ class Collection(FitsFolder):
             another model or other options, or another process writes to the folder.
         """
         given, left_out = find_sources(shapes, self.store)
-        requested = Setting(self.store, str(model), config or FitConfig(), tuple(only), tuple(without), sequence)
+        chosen, left = ((each,) if isinstance(each, str) else tuple(each) for each in (only, without))
+        requested = Setting(self.store, str(model), config or FitConfig(), chosen, left, sequence)
         with self.store.exclusive(), open_workers(self.workers) as workers:
             setting = select_setting(requested, sources := self._with_earlier(given))
             if model == AUTO:
@@ -461,7 +462,7 @@ class Collection(FitsFolder):
         poor
             Whether to include poor fits.
         leave_out
-            Names of shapes to leave out; * and ? are wildcards.
+            Names of shapes to leave out, or one name; * and ? are wildcards.
 
         Yields
         ------

@@ -83,13 +83,13 @@ class Registered(ShortRepr):
         )
 
 
-def match_names(names: Iterable[str], patterns: Sequence[str]) -> set[str]:
-    """Names that match any of the patterns, with wildcards * and ?; `InputError` if a pattern matches none.
+def match_names(names: Iterable[str], patterns: str | Sequence[str]) -> set[str]:
+    """Names that match one or any of several patterns, with wildcards * and ?; `InputError` if a pattern matches none.
 
     A pattern may also be the name of a file: a name with its suffix.
     """
     known, found = list(names), set[str]()
-    for pattern in patterns:
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
         meant = fnmatch.filter(known, pattern) or fnmatch.filter(known, os.path.splitext(pattern)[0])
         if not meant:
             close = get_close_matches(pattern, known, n=1)

@@ -526,6 +526,12 @@ def test_a_shape_of_another_kind_is_called_so(tmp_path: Path) -> None:
     )
 
 
+def test_one_part_may_be_a_string(tmp_path: Path) -> None:
+    for choice in ("only", "without"):
+        with pytest.raises(InputError, match=r"has no part 12$"):
+            meshmatch.Collection(tmp_path / choice, workers=1).fit(SAMPLES / "fox.ply", model="human", **{choice: "12"})
+
+
 def test_every_file_of_a_folder_has_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """But what belongs to a shape; and nothing takes the others for shapes, nor for failures."""
     scans, fits = tmp_path / "scans", tmp_path / "fits"

@@ -112,6 +112,11 @@ def test_what_cannot_be_compared() -> None:
     assert caught.value.hint == f"there are 5: {', '.join(names)}"
     with pytest.raises(OptionError, match="two shapes"):
         atlas.compare(names[:1], names[1:])
+    with pytest.raises(OptionError, match="two shapes"):
+        atlas.compare(names[0], names[1:])
+    with pytest.raises(InputError, match=f"'{names[0]}' is in both groups"):
+        atlas.compare(names[0], names)
+    assert atlas.rows(names[3]).tolist() == [3]
     with pytest.raises(OptionError, match="too few"):
         atlas.compare(names[:2], names[2:], kind="hotelling")
     with pytest.raises(OptionError, match="statistic"):

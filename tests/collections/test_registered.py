@@ -47,6 +47,7 @@ def test_what_is_named_is_left_out(folder: Path) -> None:
         (folder / "group.txt").write_text("b1\nb2\n")
         assert read_group(folder / "group.txt", found) == ["b1"]
     assert match_names(["cut-1", "cut-2", "b"], ["cut-*"]) == {"cut-1", "cut-2"}
+    assert match_names(["cut-1", "cut-2", "b"], "cut-*") == {"cut-1", "cut-2"}
     with pytest.raises(InputError, match="no shape called b9") as caught, registered_meshes(folder, ["b9"]):
         pass
     assert caught.value.hint.startswith("did you mean b")
