@@ -158,7 +158,7 @@ def volume_energy(F: Any) -> Any:
     """
     a, b, c = _columns(F)
     # triple product: several times faster than a batched LU
-    return ((namespace(a).linalg.cross(a, b) * c).sum(-1) - 1) ** 2
+    return _in_precision_of(F, ((namespace(a).linalg.cross(a, b) * c).sum(-1) - 1) ** 2)
 
 
 def arap_energy(F: Any) -> Any:
@@ -183,17 +183,36 @@ def arap_energy(F: Any) -> Any:
     a, b, c = _columns(F)
     diagonal = ((a * a).sum(-1) - 1) ** 2 + ((b * b).sum(-1) - 1) ** 2 + ((c * c).sum(-1) - 1) ** 2
     mixed = (a * b).sum(-1) ** 2 + (a * c).sum(-1) ** 2 + (b * c).sum(-1) ** 2
-    return namespace(a).sqrt(diagonal + 2 * mixed + 1e-12)
+    return _in_precision_of(F, namespace(a).sqrt(diagonal + 2 * mixed + 1e-12))
 
 
 def _columns(F: Any) -> tuple[Any, Any, Any]:
-    """The columns of matrices (..., 3, 3); `InputError` for anything else."""
+    """The columns of matrices (..., 3, 3), of half precision in single precision; `InputError` for anything else.
+
+    In half precision fourth powers overflow soon, and the square root would have no gradient at a rotation.
+    """
     given: Any = F
     if not (is_tensor(F) or (isinstance(F, np.ndarray) and F.dtype.kind == "f")):
         given = as_numbers(F, "deformation gradients")
     if tuple(given.shape[-2:]) != (3, 3):
         raise InputError(f"deformation gradients must be (..., 3, 3), not {tuple(given.shape)}")
+    if _is_half(given):
+        given = given.astype(np.float32) if isinstance(given, np.ndarray) else given.float()
     return given[..., 0], given[..., 1], given[..., 2]
+
+
+def _in_precision_of(F: Any, energy: Any) -> Any:
+    """Round an energy to half precision if F has it."""
+    if not _is_half(F):
+        return energy
+    if is_tensor(F):
+        return energy.half()
+    with np.errstate(over="ignore"):
+        return energy.astype(np.float16)
+
+
+def _is_half(array: Any) -> bool:
+    return getattr(array, "dtype", None) in (np.float16, torch.float16)
 
 
 def code_rows(D: int) -> int:

@@ -208,6 +208,15 @@ def test_energies_are_of_arrays_and_of_tensors(energy: Any) -> None:
     assert isinstance(found, np.ndarray) and found.shape == (12,) and energy(np.eye(3, dtype=int)) < 1e-5
     assert energy(F.astype(np.float32)).dtype == np.float32
     assert torch.autograd.gradcheck(energy, tensor) and energy(tensor).detach().numpy() == pytest.approx(found)
+    for scale in (1, 12):  # the fourth power of 12 is near the largest number in half precision
+        half = (scale * F).astype(np.float16)
+        exact = energy(half.astype(float))
+        limit = np.where(exact < 65504, exact, np.inf)
+        for made in (energy(half), energy(torch.from_numpy(half)).numpy()):
+            assert made.dtype == np.float16 and made == pytest.approx(limit, rel=1e-3)
+    resting = torch.eye(3, dtype=torch.float16, requires_grad=True)
+    energy(resting).backward()
+    assert resting.grad is not None and (resting.grad == 0).all()
     for wrong in (F[:, :2], torch.zeros(3, 2), "a", 1.0, np.zeros((0, 3))):
         with pytest.raises(InputError, match="deformation gradients"):
             energy(wrong)
