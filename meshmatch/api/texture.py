@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from meshmatch.api.results import MapPair
-from meshmatch.api.transfer import MapLike, find_maps
+from meshmatch.api.transfer import MapLike, find_maps, is_given
 from meshmatch.api.upright import turn_upright
 from meshmatch.arrays import Ints, ShortRepr
 from meshmatch.errors import InputError, OptionError
@@ -188,6 +188,8 @@ def transfer_texture(
     polygons = None
     if file is not None and file.suffix.lower() == ".obj" and not mesh.is_cloud:
         polygons = obj_text.polygons_of(file.name, read_bytes(file), mesh.verts_or_nan).of_triangles
+    if is_given(match):
+        match = find_maps(shape, mesh, match)  # a wrong map is refused before the long work
     began = time.monotonic()
     with thread_limit(1):
         if uv == "source":

@@ -110,6 +110,11 @@ def find_maps(source: ShapeLike, target: ShapeLike, match: MapLike = None) -> Ma
     return found
 
 
+def is_given(match: MapLike) -> bool:
+    """Whether `find_maps` reads a map, or takes one, instead of making it."""
+    return isinstance(match, str | Path | VertexMap | MatchResult | MapPair)
+
+
 def have_same_faces(source: Shape, target: Shape) -> bool:
     """Whether two meshes have the same vertex count and the same triangles in the same order."""
     return source.V == target.V and source.F > 0 and np.array_equal(source.faces, target.faces)

@@ -94,10 +94,9 @@ def transfer_texture(
             done.writer(temporary[0], output)
             record, pair = transfer.report_low(done.low, rule.minimum), done.maps
         else:
+            match = transfer if maps.map is None else transfer(a, b)  # a wrong map is refused before the long work
             with transfer.console.progress() as report:
-                made = meshmatch.transfer_texture(
-                    a, target, transfer, uv=uv, options=baking, look=look, progress=report
-                )
+                made = meshmatch.transfer_texture(a, target, match, uv=uv, options=baking, look=look, progress=report)
             made.dressed.write(output, temporary)
             record, pair = _report_baked(transfer.console, made, rule, texture), made.maps
             if made.dressed.turned and output.suffix.lower() == ".glb":

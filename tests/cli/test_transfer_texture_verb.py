@@ -9,6 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import meshmatch
+from meshmatch.api import texture
+from meshmatch.api.results import MapPair
+from meshmatch.errors import InputError
 from meshmatch.maps.files import load_map, save_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes import dressed_files
@@ -413,6 +417,22 @@ def test_what_cannot_be_is_told_before_the_work(
 ) -> None:
     spoil()
     refused(run(*words), said, pair, {path.name for path in pair.iterdir()})
+
+
+def test_a_map_of_the_wrong_direction_is_refused_before_the_target_is_unwrapped(
+    run: Run, pair: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_work(*_: object) -> None:
+        raise RuntimeError("unwrapped")
+
+    found = load_map("ab.npz", load_shape("a.glb"), load_shape("b.ply"))
+    save_map("ba.npz", replace(MapPair(load_shape("a.glb"), load_shape("b.ply"), found).backward, verdict="good"))
+    monkeypatch.setattr(texture, "atlas_of", no_work)
+    before = {path.name for path in pair.iterdir()}
+    refused(run(*call(map="ba.npz")), "b.ply to a.glb", pair, before)
+    for match in ("ba.npz", load_map("ba.npz")):
+        with pytest.raises(InputError, match=r"b\.ply to a\.glb"):
+            meshmatch.transfer_texture("a.glb", "b.ply", match)
 
 
 def test_a_full_disk_leaves_nothing(run: Run, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
