@@ -12,6 +12,7 @@ from meshmatch.errors import InputError
 from meshmatch.experiments.bench import any_shapes
 from meshmatch.experiments.bench.any_shapes import error_of, keypoints_of, row_of, symmetries
 from meshmatch.experiments.bench.methods import EarlierVersion
+from meshmatch.experiments.pages import results_file
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -82,6 +83,13 @@ def test_another_method_that_fails_is_counted_as_a_map_to_one_vertex(folder: Pat
     right, wrong = (any_shapes.measure_by(method, folder, ("1", "2")) for method in (Nearest(), Fails()))
     assert (right["error"], right["failed"]) == (0.0, False)
     assert wrong["failed"] and wrong["error"] > 20
+
+
+@pytest.mark.parametrize("name", ["any-shapes", "any-turning"])
+def test_saved_tables_have_the_headings_of_new_ones(name: str) -> None:
+    first, *others = results_file(name)["tables"]
+    assert first["columns"] == list(any_shapes._COLUMNS) and "over 20 and flagged" in first["columns"]
+    assert [table["title"] for table in others][:1] in ([], ["Other methods, 12 pairs of each class"])
 
 
 def test_a_row_counts_every_pair_and_names_the_worst() -> None:

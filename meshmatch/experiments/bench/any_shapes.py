@@ -71,7 +71,7 @@ _COLUMNS |= {
     "good": "good:d",
     "good over 10": "good_over:d",
     "over 20": "far_off:d",
-    "told": "told:d",
+    "over 20 and flagged": "told:d",
     "worst": "worst",
     "error": "worst_error:.1f",
     "CPU s": "cpu:.1f",
@@ -430,9 +430,7 @@ def main(
     if beside or earlier is not None:
         record["beside"], notes = _compare_methods(found, beside, earlier, limit_beside, data, work, seed)
         tables.append(
-            runner.table(
-                f"Beside other methods, {limit_beside} pairs of each class", record["beside"], _COMPARISON_COLUMNS
-            )
+            runner.table(f"Other methods, {limit_beside} pairs of each class", record["beside"], _COMPARISON_COLUMNS)
         )
     if draw is not None:
         draw_worst(rows[: len(names)], draw, data, Matcher(model, FitConfig(seed=seed)))
