@@ -203,9 +203,10 @@ def transfer_shapes(
     given = shapes if isinstance(shapes, BlendShapes) else load_blend_shapes(shapes, a)
     maps = find_maps(a, b, match)
     began = time.monotonic()
-    Progress(progress, b.name, "transferring displacements")(0.0)
+    report = Progress(progress, b.name, "transferring displacements")
+    report(0.0)
     with thread_limit(1):
-        moves = carry_moves(given.moves, maps.forward, maps.backward, a, b)
+        moves = carry_moves(given.moves, maps.forward, maps.backward, a, b, report)
     is_still = [bool(old.any()) and not new.any() for old, new in zip(given.moves, moves, strict=True)]
     still = tuple(name for name, flag in zip(given.names, is_still, strict=True) if flag)
     original = Path(target) if isinstance(target, str | Path) else None

@@ -190,6 +190,7 @@ def transfer_texture(
         polygons = obj_text.polygons_of(file.name, read_bytes(file), mesh.verts_or_nan).of_triangles
     if is_given(match):
         match = find_maps(shape, mesh, match)  # a wrong map is refused before the long work
+    unwrapping = Progress(progress, mesh.name, "texture coordinates")
     began = time.monotonic()
     with thread_limit(1):
         if uv == "source":
@@ -197,8 +198,9 @@ def transfer_texture(
             check_layout(shape, look)
             atlas = None
         else:
-            Progress(progress, mesh.name, "texture coordinates")(0.0)
-            atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons, options.tiles)
+            unwrapping(0.0)
+            atlas = atlas_of(mesh, own, options.size, options.padding, uv, polygons, options.tiles, unwrapping)
+            unwrapping(1.0)
     unwrapped = time.monotonic() - began
     maps = find_maps(shape, mesh, match)
     began = time.monotonic() - unwrapped
@@ -207,9 +209,8 @@ def transfer_texture(
         if atlas is None:
             atlas = _transfer_layout(shape, look, maps, polygons, options.size)
         elif atlas.shared:
-            atlas = _check_shared(
-                atlas, bake.contradicting_share(shape, look, mesh, maps.backward, atlas), mesh, options, uv, polygons
-            )
+            contradicted = bake.contradicting_share(shape, look, mesh, maps.backward, atlas)
+            atlas = _check_shared(atlas, contradicted, mesh, options, uv, polygons, unwrapping)
         tiles: dict[int, BakedMaterial] = {}
         if atlas.tiles is None:
             baked = bake.transfer_texture(shape, look, mesh, maps.backward, atlas, options, report, maps.forward)
@@ -230,12 +231,18 @@ def tiles_of_file(path: Path, mesh: Shape, size: int) -> list[int]:
 
 
 def _check_shared(
-    atlas: Atlas, contradicted: float, mesh: Shape, options: BakeOptions, uv: Keep, polygons: Ints | None
+    atlas: Atlas,
+    contradicted: float,
+    mesh: Shape,
+    options: BakeOptions,
+    uv: Keep,
+    polygons: Ints | None,
+    progress: Progress,
 ) -> Atlas:
     """Keep texture coordinates with shared texels if the places that share them look alike; else unwrap anew or raise."""
     if contradicted > _MAX_CONTRADICTED:
         problem = f"they overlap, and {100 * contradicted:.0f} % of the overlapping surface looks different"
-        return new_atlas(mesh, options.size, options.padding, uv, polygons, problem)
+        return new_atlas(mesh, options.size, options.padding, uv, polygons, problem, progress)
     note_text = (
         f"{mesh.name}: its own texture coordinates give {100 * atlas.shared:.0f} % of their texels to several places"
     )

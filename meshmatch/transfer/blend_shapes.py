@@ -18,6 +18,7 @@ from meshmatch.geometry.triangles import dot, normalized, triangle_vectors
 from meshmatch.maps.indices import corners_of
 from meshmatch.maps.mapped_mesh import length_of
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.progress import Progress
 from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.clean_weights import same_at
@@ -43,7 +44,12 @@ _N_NEIGHBORS, _N_AROUND = 12, 4
 
 
 def carry_moves(
-    moves: Float[Floats32, "K V_source 3"], forward: VertexMap, backward: VertexMap, source: Shape, target: Shape
+    moves: Float[Floats32, "K V_source 3"],
+    forward: VertexMap,
+    backward: VertexMap,
+    source: Shape,
+    target: Shape,
+    progress: Progress = Progress(),
 ) -> Float[Floats32, "K V_target 3"]:
     """Displacements (K, V_target, 3) of the target's vertices, in its frame and unit."""
     rotations, scale = local_frames(forward, source, target)
@@ -65,6 +71,7 @@ def carry_moves(
     ) >= _MIN_KNOWN * np.bincount(part)
     for k, move in enumerate(moved):
         moved[k] = diffuse(graph, known, np.where(known[:, None], move, 0.0))[0]
+        progress((k + 1) / len(moved))
     _move_rigidly(
         moved,
         target,

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import normalized, triangle_areas, triangle_vectors
+from meshmatch.progress import Progress
 from meshmatch.shapes.decimate import decimate
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import Layout, adjacent_faces, flatten_faces
@@ -85,7 +86,9 @@ class _Surface:
         return np.inf if layout is None else float(self.areas[members[layout.bad]].sum())
 
 
-def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons: Int[Ints, " F"]) -> list[Chart]:
+def chart_regions(
+    verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons: Int[Ints, " F"], progress: Progress = Progress()
+) -> list[Chart]:
     """Charts that cover every triangle once: compact, with little stretch, free of overlaps.
 
     Parameters
@@ -94,25 +97,32 @@ def chart_regions(verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], polygons
         The surface, in units of sqrt(area).
     polygons
         (F,) the polygon that each triangle belongs to; polygons are not cut where charts meet.
+    progress
+        Called with the share (0..1) that is done, approximately.
     """
     surface = _Surface(verts, faces, _TEXELS[1])
     copy = _Surface(*_decimated(verts, faces, _COARSE_FACES), _TEXELS[0])
     own_polygon = np.arange(len(copy.faces))
+    progress(0.05)
     cells = _split_until_flat(
         copy, _smooth_regions(copy, _grow_cells(copy), _COPY_SMOOTHING), _COPY_STRETCH, own_polygon
     )
+    progress(0.1)
     regions = np.empty(len(copy.faces), np.int64)
     for label, chart in enumerate(_ChartMerger(copy, cells, _COPY_STRETCH).charts()):
         regions[chart.members] = label
+    progress(0.2)
     if len(faces) // len(copy.faces) > _MAX_SMOOTHING:
         between = _Surface(*_decimated(verts, faces, int(np.sqrt(len(faces) * len(copy.faces)))), _TEXELS[1])
         copy, regions = between, _transfer_regions(copy, regions, between)
     region = _transfer_regions(copy, regions, surface)
+    progress(0.4)
     first, number = np.unique(polygons, return_index=True, return_inverse=True)[1:]
     region = _connect_regions(surface, region[first][number])
-    charts = _split_until_flat(surface, region, _MAX_STRETCH, number)
+    charts = _split_until_flat(surface, region, _MAX_STRETCH, number, progress.between(0.4, 0.65))
     charts = _ChartMerger(surface, charts, _MAX_STRETCH, crumbs_only=True).charts()
-    return HingeMerger(surface.verts, surface.faces, charts, _MAX_STRETCH, surface.texels).charts()
+    merger = HingeMerger(surface.verts, surface.faces, charts, _MAX_STRETCH, surface.texels)
+    return merger.charts(progress.between(0.7, 1.0))
 
 
 def _transfer_regions(copy: _Surface, regions: Ints, surface: _Surface) -> Int[Ints, " F"]:
@@ -240,15 +250,22 @@ def _connected_parts(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
-def _split_until_flat(surface: _Surface, region: Ints, max_stretch: float, polygons: Ints) -> list[Chart]:
+def _split_until_flat(
+    surface: _Surface, region: Ints, max_stretch: float, polygons: Ints, progress: Progress = Progress()
+) -> list[Chart]:
     """Split regions until each can be flattened. Small flipped or overlapping parts of a region go to its neighbors;
-    regions with larger ones are bisected.
+    regions with larger ones are bisected. Reports the share of triangles that were tried at least once.
     """
     cache, tried = _LayoutCache(surface, max_stretch, polygons), set[int]()
     iteration = 0
     while True:
         parts, bad_parts, new = _members_of_regions(region), [np.empty(0, np.int64)], region.copy()
-        layouts = [cache.layout(members) for members in parts]
+        layouts, done = list[Layout | None](), 0
+        for members in parts:
+            layouts.append(cache.layout(members))
+            done += len(members)
+            if iteration == 0:
+                progress(done / len(region))
         for members, layout in zip(parts, layouts, strict=True):
             if layout is not None and not len(layout.bad):
                 continue

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.geometry.triangles import component_minima, triangle_areas
+from meshmatch.progress import Progress
 from meshmatch.transfer.flat_layout import Layout, flatten_faces, opposite_edges
 from meshmatch.transfer.pack_charts import Chart, hull_area
 
@@ -103,14 +104,16 @@ class HingeMerger:
     def _set_shared(self, a: int, b: int, edges: _Edges) -> None:
         self.shared[a][b], self.shared[b][a] = edges, _Edges(edges.two[::-1, ::-1], edges.one[::-1, ::-1])
 
-    def charts(self) -> list[Chart]:
+    def charts(self, progress: Progress = Progress()) -> list[Chart]:
         """Merge along hinges, then by flattening again, while there are more charts than wanted; return the charts."""
         for self.reflatten, min_charts in ((False, _MIN_CHARTS), (True, _MIN_CHARTS_REFLATTEN)):
             if len(self.by_id) > min_charts:
-                for one, others in self.shared.items():
+                for done, (one, others) in enumerate(self.shared.items()):
                     for two in others:
                         if one < two:
                             self._enqueue(one, two)
+                    if not self.reflatten:  # most of the work
+                        progress((done + 1) / len(self.shared))
             while self.queue and len(self.by_id) > min_charts:
                 _, one, two, chart = heappop(self.queue)
                 if one in self.by_id and two in self.by_id and (merged := chart or self._flatten_pair(one, two)):

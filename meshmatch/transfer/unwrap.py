@@ -10,6 +10,7 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr
 from meshmatch.errors import InputError, OptionError
 from meshmatch.geometry.triangles import planar_areas
+from meshmatch.progress import Progress
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.flat_layout import weld
 from meshmatch.transfer.new_charts import new_charts
@@ -68,6 +69,7 @@ def atlas_of(
     keep: Keep = "auto",
     polygons: Ints | None = None,
     tiled: bool = True,
+    progress: Progress = Progress(),
 ) -> Atlas:
     """Choose the coordinates for baking an image of a size.
 
@@ -85,6 +87,8 @@ def atlas_of(
         (F,) the polygon that each triangle belongs to: new seams do not cross polygons.
     tiled
         Whether own coordinates in several tiles stay there.
+    progress
+        Called with the share (0..1) of unwrapping that is done, approximately.
 
     Raises
     ------
@@ -107,10 +111,10 @@ def atlas_of(
             message = f"{name}: its own texture coordinates overlap on {100 * shared:.1f} % of their texels"
             note = f"{message}, each of which shows only one of two places" if shared > _NEGLIGIBLE_OVERLAP else ""
             return Atlas(within, True, note, shared if shared > _MAX_OVERLAP else 0.0)
-        return new_atlas(shape, size, padding, keep, polygons, problem)
+        return new_atlas(shape, size, padding, keep, polygons, problem, progress)
     if keep == "keep":
         raise OptionError(f"{name} has no texture coordinates to keep", _NEW_HINT)
-    return Atlas(unwrapped(shape, size, padding, polygons), False)
+    return Atlas(unwrapped(shape, size, padding, polygons, progress), False)
 
 
 def check_surface(shape: Shape) -> None:
@@ -123,14 +127,22 @@ def check_surface(shape: Shape) -> None:
         raise InputError(f"{name} has no triangle with an area", "is it a mesh?")
 
 
-def new_atlas(shape: Shape, size: int, padding: int, keep: Keep, polygons: Ints | None, problem: str) -> Atlas:
+def new_atlas(
+    shape: Shape,
+    size: int,
+    padding: int,
+    keep: Keep,
+    polygons: Ints | None,
+    problem: str,
+    progress: Progress = Progress(),
+) -> Atlas:
     """New coordinates instead of the file's own, because of a `problem` with these; `OptionError` if the file's own must be
     kept, `InputError` for triangles as thin as a thread.
     """
     message = f"{shape.name or 'the target'}: its own texture coordinates cannot be used: {problem}"
     if keep == "keep":
         raise OptionError(message, _NEW_HINT)
-    return Atlas(unwrapped(shape, size, padding, polygons), False, f"{message}; new ones were made")
+    return Atlas(unwrapped(shape, size, padding, polygons, progress), False, f"{message}; new ones were made")
 
 
 def _check_coordinates(uv: Floats, shape: Shape, size: int) -> tuple[Floats, str, float]:
@@ -214,7 +226,9 @@ def shared_texels(uv: Float[Floats, "F 3 2"], size: int = 1024) -> float:
     return float((other[used] != len(uv) - 1 - found[used]).mean())
 
 
-def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = None) -> Floats:
+def unwrapped(
+    shape: Shape, size: int, padding: int, polygons: Ints | None = None, progress: Progress = Progress()
+) -> Floats:
     """(F, 3, 2) new coordinates, not mirrored; `InputError` for triangles as thin as a thread."""
     real = np.flatnonzero(shape.face_areas > 0)
     used, corners = np.unique(shape.faces[real], return_inverse=True)
@@ -228,7 +242,7 @@ def unwrapped(shape: Shape, size: int, padding: int, polygons: Ints | None = Non
     corners = weld(verts, corners)
     if (is_triangle := (corners != corners[:, [1, 2, 0]]).all(axis=1)).any():
         real, corners = real[is_triangle], corners[is_triangle]
-    uv = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real])
+    uv = new_charts(verts, corners, size, padding, None if polygons is None else polygons[real], progress)
     out = np.zeros((shape.F, 3, 2))
     # A margin at the border too: a repeated image continues there with its opposite side.
     margin = min(_MARGIN, padding) / size

@@ -200,11 +200,13 @@ def test_a_texture_is_baked_and_saved(pair: tuple[Shape, Shape, VertexMap], tmp_
     source, target, found = pair
     red = Shape(source.verts, source.faces, "red", np.tile([1.0, 0, 0, 1], (source.V, 1)))
     options = meshmatch.BakeOptions(size=64)
-    stages: list[str] = []
+    seen: list[tuple[str, float]] = []
     result = meshmatch.transfer_texture(
-        red, target, found, options=options, progress=lambda stage, name, share: stages.append(stage)
+        red, target, found, options=options, progress=lambda stage, name, share: seen.append((stage, share))
     )
-    assert list(dict.fromkeys(stages)) == ["texture coordinates", "baking"]
+    assert list(dict.fromkeys(stage for stage, _ in seen)) == ["texture coordinates", "baking"]
+    shares = [share for stage, share in seen if stage == "texture coordinates"]
+    assert shares == sorted(shares) and (shares[0], shares[-1]) == (0.0, 1.0) and len(set(shares)) > 8
     assert result.baked.image.shape == (64, 64, 4)
     assert (np.median(result.baked.image.reshape(-1, 4), axis=0)[:3] == [255, 0, 0]).all()
     result.save(tmp_path / "b.glb")

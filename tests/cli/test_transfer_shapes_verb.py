@@ -156,13 +156,13 @@ def test_shapes_that_move_nothing_are_named(run: Run, pair: Path) -> None:
     moves = np.zeros((2, a.V, 3), np.float32)
     moves[0, 600:] = [0, 0.1, 0]
     moves[1, :100] = [0, 0.1, 0]
-    stages: list[str] = []
+    seen: list[tuple[str, float]] = []
     result = meshmatch.transfer_shapes(
         "a.glb", half, VertexMap.between(a, half, np.minimum(np.arange(a.V), 319), confidence=(np.arange(a.V) < 320) * 1.0),
         shapes=BlendShapes(("top", "bottom"), moves, np.zeros(2)),
-        progress=lambda stage, name, share: stages.append(stage),
+        progress=lambda stage, name, share: seen.append((stage, share)),
     )  # fmt: skip
-    assert result.still == ("top",) and stages == ["transferring displacements"]
+    assert result.still == ("top",) and seen == [("transferring displacements", k / 2) for k in range(3)]
 
 
 WRONG = [
