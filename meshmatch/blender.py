@@ -71,7 +71,7 @@ def command(name: str) -> list[str]:
 
 
 def convert_to_glb(path: Path) -> bytes:
-    """Convert a file to glb: in meters, y up, with materials, skeletons, clips and morph targets.
+    """Convert a file to glb: in metres, y up, with materials, skeletons, clips and morph targets.
 
     `InputError` if Blender cannot read it, `OptionError` if there is no Blender.
     """

@@ -93,7 +93,7 @@ class Prepared(ShortRepr):
     template
         The template.
     shapes
-        (N, V, 3) the template's vertices on each registered shape, in its own axes and unit, centered; N = 0 unless all
+        (N, V, 3) the template's vertices on each registered shape, in its own axes and unit, centred; N = 0 unless all
         shapes are registered.
     names
         Names of the shapes' files.

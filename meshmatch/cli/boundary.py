@@ -80,7 +80,7 @@ def _kills_as_interrupts() -> Iterator["_Killed"]:
     owner = os.getpid()
 
     def stop(number: int, frame: Any) -> None:
-        if os.getpid() != owner:  # a forked process: restore the default behavior
+        if os.getpid() != owner:  # a forked process: restore the default behaviour
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return

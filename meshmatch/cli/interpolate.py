@@ -120,7 +120,7 @@ def interpolate(
 
 
 def _draw_strip(path: Path, result: "meshmatch.Interpolation", key_shapes: dict[float, str]) -> None:
-    """Draw all shapes in a row, labeled by time, or by the name of the given shape at that time."""
+    """Draw all shapes in a row, labelled by time, or by the name of the given shape at that time."""
     from meshmatch.render.figures import Panel
     from meshmatch.render.picture import render_shapes
 

@@ -32,7 +32,7 @@ _MAX_EFFECTS = 12  # pictures of a linear model
 _AXIS_IMAGE_SIZE = 260  # longest side of the images at the ends of axes, in pixels
 _BACK = np.diag([-1.0, 1.0, -1.0])
 _STEEP = 0.95  # cosine with the up axis from which on a view counts as straight from above or below
-_NEIGHBORHOOD = 0.1  # radius around a vertex within which normals are averaged for the view, in sqrt(area)
+_NEIGHBOURHOOD = 0.1  # radius around a vertex within which normals are averaged for the view, in sqrt(area)
 
 
 def furthest(atlas: Atlas) -> list[int]:
@@ -151,7 +151,7 @@ def draw_asymmetry(folder: Path, mean: Shape, found: Asymmetry, turn: Float[Floa
 
 def _view_of(mean: Shape, vertex: int, turn: Float[Floats, "3 3"]) -> Float[Floats, "3 3"]:
     """The rotation that turns a vertex of a surface towards the viewer, with the shape's up axis as upright as possible."""
-    near = np.linalg.norm(mean.verts - mean.verts[vertex], axis=1) < _NEIGHBORHOOD * np.sqrt(mean.area)
+    near = np.linalg.norm(mean.verts - mean.verts[vertex], axis=1) < _NEIGHBOURHOOD * np.sqrt(mean.area)
     ahead = mean.vertex_normals[near].sum(axis=0)
     ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-9 else turn[2]
     right = np.cross(turn[1] if abs(turn[1] @ ahead) < _STEEP else -turn[2], ahead)

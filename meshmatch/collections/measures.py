@@ -1,7 +1,7 @@
 """Quality of an atlas by its number of modes: compactness, generalisation and specificity.
 
 Source: Davies, Learning shape: optimal models for analysing natural variability (2002). Distances between corresponding
-points favor consistently wrong correspondences, as errors that all shapes share go unnoticed. Distances between surfaces,
+points favour consistently wrong correspondences, as errors that all shapes share go unnoticed. Distances between surfaces,
 which do not depend on correspondences, are therefore given as well.
 """
 

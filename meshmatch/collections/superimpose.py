@@ -116,7 +116,7 @@ class Superimposed(ShortRepr):
             left, _, right = np.linalg.svd(spread)
             left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
             rotations[:, group] = left @ right
-            if count > 1:  # a single group stays centered on the origin
+            if count > 1:  # a single group stays centred on the origin
                 places[group] = weights @ there
         sizes = np.sqrt(squared if self.groups is None else squared / shares.sum())
         if not (sizes > 0).all():

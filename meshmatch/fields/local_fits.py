@@ -32,7 +32,7 @@ class LocalFits:
     weight: Any  # (N,) w(d)
     slope: Any  # (N,) (dw/dd) / d
     scale: Any  # (N,) unit of length of the basis at the point
-    basis: Any  # (N, 4) p(q_i), centered on x
+    basis: Any  # (N, 4) p(q_i), centred on x
     inverse: Any  # (P, 4, 4) inverse moment matrices
 
     @classmethod
@@ -41,7 +41,7 @@ class LocalFits:
     ) -> LocalFits:
         """Fit at points (P, 3) with nodes (K, 3) and radii (K,), all arrays or all tensors, in float64 or float32.
 
-        ``pairs`` are indices of points and of nodes that move them, by default those in reach. ``flat`` regularizes moment
+        ``pairs`` are indices of points and of nodes that move them, by default those in reach. ``flat`` regularises moment
         matrices by this share of their weight; without it `TemplateError` names points that lack nodes.
         """
         xp = namespace(points)
@@ -93,7 +93,7 @@ class LocalFits:
     def second_derivative(self) -> Any:
         """(N, 3, 3) d2Phi_i / dx_k dx_l at the points.
 
-        With M a = p(x) and Phi_i = w_i p(q_i)^T a, in a basis that is centered on the point and fixed.
+        With M a = p(x) and Phi_i = w_i p(q_i)^T a, in a basis that is centred on the point and fixed.
         """
         at, basis, inverse, P = self.at, self.basis, self.inverse, len(self.inverse)
         xp, full, a = namespace(basis), outer(basis), inverse[:, :, 0]

@@ -7,7 +7,7 @@ Matching* (NeurIPS 2022), supplement:
     Phi_i  = p(x)^T M(x)^-1 w_i(x) p(q_i),    p(x) = [1, x, y, z]^T
     M(x)   = sum_i w_i(x) p(q_i) p(q_i)^T
 
-The basis is evaluated in coordinates centered on x and scaled by the support radius (the largest one there, if nodes have
+The basis is evaluated in coordinates centred on x and scaled by the support radius (the largest one there, if nodes have
 different radii). The functions do not depend on the affine frame of the basis, and the 4 x 4 moment matrices are well
 conditioned in this one.
 
@@ -44,7 +44,7 @@ MAX_AMPLIFICATION = 50.0
 that ship it is at most 22; above 1 / sqrt(`MINIMUM_EIGENVALUE`), 1,000, nodes are refused anyway."""
 _MAX_CONDITION = 1e13
 _BLOCK = 4096
-_REGULARIZATION = 1e-3  # regularization of moment matrices, relative to their weight
+_REGULARIZATION = 1e-3  # regularisation of moment matrices, relative to their weight
 
 
 def has_nodes(name: FieldName) -> bool:
@@ -154,7 +154,7 @@ def build_surface_field(
 
     Pairs are indices of points and nodes, sorted by point, at least one for each point. Thus the two sides of a thin
     sheet, or two limbs that touch, can have separate nodes. The nodes of a point may lie in a plane: moment matrices are
-    regularized, so that the field is nearly constant across the plane. Rows of ``phi`` sum to nearly one.
+    regularised, so that the field is nearly constant across the plane. Rows of ``phi`` sum to nearly one.
     """
     fit = LocalFits.of(points, nodes, radii, "smooth", pairs, _REGULARIZATION)
     values = csr_matrix((fit.values, (fit.at, fit.of_node)), (len(points), len(nodes)))

@@ -263,7 +263,7 @@ def _fits_from_mean(
 ) -> tuple[tuple[Fit, Fit], NodeSystem] | None:
     """Fits of a template halfway between two shapes to both of them.
 
-    Each shape then has half as far to go, and neither is favored. The mean of two fits contains their errors, so it is
+    Each shape then has half as far to go, and neither is favoured. The mean of two fits contains their errors, so it is
     computed again twice. None if one of the shapes has another pose than the template.
     """
     first, second = fits

@@ -18,7 +18,7 @@ _POSE_TOLERANCE = 1e-4  # iteration stops once no entry of a pose changes by mor
 
 
 class ClosestPoints:
-    """Two centered point sets. Poses are those of the target: ``pose.to_world(target)`` approximates the shape.
+    """Two centred point sets. Poses are those of the target: ``pose.to_world(target)`` approximates the shape.
 
     ``queries`` are the rows of the shape and of the target that search for their closest point among all points of the
     other set; by default all rows.

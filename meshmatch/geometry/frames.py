@@ -34,7 +34,7 @@ class Frame(ShortRepr, PickledFields):
     """
 
     scale: float  # file length that becomes 1; positive
-    rotation: Float[Floats, "3 3"]  # applied after centering; orthonormal, determinant +1, or -1 for a mirrored frame
+    rotation: Float[Floats, "3 3"]  # applied after centring; orthonormal, determinant +1, or -1 for a mirrored frame
     center: Float[Floats, " 3"]  # file point that becomes the origin
 
     def __post_init__(self) -> None:

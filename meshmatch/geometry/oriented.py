@@ -145,7 +145,7 @@ def nearest_by_brute_force(
     Faster than a k-d tree, which is slow for queries far from the points. Among points whose squared distances differ
     by less than rounding, about a millionth of the largest, any may be returned.
     """
-    middle = points.mean(0)  # centering keeps float32 accurate
+    middle = points.mean(0)  # centring keeps float32 accurate
     points, queries = (np.asarray(each - middle, np.float32) for each in (points, queries))
     P, D = points.shape
     matrix = np.empty((D + 1, P if P % _CONFLICT_STRIDE else P + _PADDING), np.float32)

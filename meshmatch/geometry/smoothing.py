@@ -60,7 +60,7 @@ def _multigrid(matrix: csr_array) -> Callable[[Floats], Floats]:
     """
     V, inverse = matrix.shape[0], 1.0 / matrix.diagonal()
     if V <= _MAX_COARSEST:
-        regularized = matrix + diags_array(1e-6 * matrix.diagonal())  # regularized: clusters may coincide
+        regularized = matrix + diags_array(1e-6 * matrix.diagonal())  # regularised: clusters may coincide
         return factorize(csc_array(regularized)).solve
     seeds = np.sort(np.random.default_rng(0).choice(V, V // _CLUSTER_SIZE, replace=False))
     graph = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)

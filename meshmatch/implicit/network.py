@@ -86,7 +86,7 @@ class Evaluated:
 
 class SineNetwork(nn.Module):
     """A scalar function of points with sine activations (Sitzmann et al., *Implicit Neural Representations with Periodic
-    Activation Functions*, NeurIPS 2020), initialized as in that paper.
+    Activation Functions*, NeurIPS 2020), initialised as in that paper.
     """
 
     def __init__(self, width: int, depth: int, frequency: float) -> None:

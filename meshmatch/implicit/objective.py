@@ -30,7 +30,7 @@ class ImplicitBatch(OnDevice):
 class ImplicitLoss(Objective):
     """Weights of DIF-Net's terms (docs/method.md); ``volume``, ``arap`` and ``blend`` (L_Z) are for the reduced field only.
 
-    At points without a distance (NaN), only ``off``, ``eikonal`` and the regularizers act. With ``published`` the terms are
+    At points without a distance (NaN), only ``off``, ``eikonal`` and the regularisers act. With ``published`` the terms are
     exactly DIF-Net's: distances are clamped, smoothness is the mean over the rows of F - I, and the distance of every
     second point off the surface is not used.
     """

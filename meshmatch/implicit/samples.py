@@ -1,7 +1,7 @@
 """Training samples of implicit models: points of shapes with normals and signed distances, where known.
 
 Watertight meshes give both. Clouds give normals only (estimated for point files, exact in `.npz` files with ``normals``).
-`.npz` files with ``points`` and ``distances`` give signed distances, negative inside. Each shape is centered and scaled by
+`.npz` files with ``points`` and ``distances`` give signed distances, negative inside. Each shape is centred and scaled by
 its bounding box into the cube from -1 to 1, without a rotation.
 """
 

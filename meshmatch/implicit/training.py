@@ -86,7 +86,7 @@ def train_implicit(
         The model's folder.
     shapes
         A folder of watertight meshes, clouds or .npz samples (the page on formats) that share an orientation; they are
-        centered and scaled, not rotated.
+        centred and scaled, not rotated.
     config
         The network; ``ImplicitConfig(field="pointwise")`` is DIF-Net's deformation, "mls" (the default) that of control
         nodes.

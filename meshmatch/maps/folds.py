@@ -77,7 +77,7 @@ def normals_or_zeros(shape: Shape) -> Float[Floats, "V 3"]:
 
 @derived
 def consistent_faces(shape: Shape) -> Int[Ints, "F 3"]:
-    """Faces reoriented so that neighbors have the same winding, which those of a file need not have."""
+    """Faces reoriented so that neighbours have the same winding, which those of a file need not have."""
     edges = shape.edges
     return (
         orient_faces(shape.verts, shape.faces, shape.face_vectors, edges)[0] if edges.disagreeing.any() else shape.faces

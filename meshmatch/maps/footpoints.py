@@ -5,7 +5,7 @@ vertex in a space of positions and normals, then the closest of that vertex's tr
 on the rest template, but is not exact for triangles that are large compared with the distance. `meshmatch.maps.mapped_mesh`
 is exact for triangles of any size; `meshmatch.transfer.surface_walk` starts from a known face and stays on its sheet.
 
-Where two sheets of a surface touch, the closest point may lie on the wrong one. Discontinuities reveal it: neighbors whose
+Where two sheets of a surface touch, the closest point may lie on the wrong one. Discontinuities reveal it: neighbours whose
 images lie far apart. The small islands that discontinuities cut off are searched again, near the images around them.
 """
 
@@ -45,7 +45,7 @@ RESTING_WEIGHT = 0.4
 # Queries per chunk, so that their data stay in the processor's cache.
 _CHUNK = 2048
 _ROUNDS = 3
-# Neighbors of a point, as a share of a cloud's points, where noise is 1 % of the diagonal; and the range of their number.
+# Neighbours of a point, as a share of a cloud's points, where noise is 1 % of the diagonal; and the range of their number.
 # Set by hand on noisy scans of bodies.
 _NEIGHBOURS, _NEIGHBOUR_RANGE = 0.005, (9, 64)
 _MEDIAN_CHUNK = 16_384  # points per chunk
@@ -175,7 +175,7 @@ def template_footpoints(shape: Shape, fit: Fit, workers: int = 1) -> tuple[Footp
     """Find the footpoint of every vertex on the fitted template, and the corresponding points on the rest template.
 
     Islands of a mesh are searched again (`reassign_islands`). A cloud has no edges that would reveal islands, and its noise
-    moves points to other sheets: each point is searched again near the median of its neighbors' places.
+    moves points to other sheets: each point is searched again near the median of its neighbours' places.
     """
     points, normals = in_core_frame(shape, fit)
     facing = vertex_normals(fit.points, fit.faces)
@@ -222,7 +222,7 @@ def neighbours(points: Float[Floats, "V 3"], roughness: float) -> Int[Ints, "V K
 
 
 def neighbour_medians(values: Float[Floats, "V D"], near: Int[Ints, "V K"]) -> Float[Floats, "V D"]:
-    """Componentwise median of the neighbors' values."""
+    """Componentwise median of the neighbours' values."""
     found = np.empty_like(values)
     for low in range(0, len(values), _MEDIAN_CHUNK):
         part = slice(low, low + _MEDIAN_CHUNK)
@@ -310,7 +310,7 @@ def surrounding_values(
 ) -> Float[Floats, "V D"]:
     """Fill in unknown rows by diffusion from their surroundings; NaN out of reach."""
     edges = edges[unknown[edges[:, 0]] | unknown[edges[:, 1]]]
-    # the unknown vertices and their neighbors
+    # the unknown vertices and their neighbours
     near, ends = np.unique(np.concatenate([edges.reshape(-1), np.flatnonzero(unknown)]), return_inverse=True)
     start, end = ends[: edges.size].reshape(-1, 2).T
     graph = csr_matrix((np.ones(len(start)), (start, end)), (len(near), len(near)))

@@ -110,7 +110,7 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
 def map_from_functional(
     C: ArrayLike, source: ShapeLike, target: ShapeLike, basis_source: ArrayLike, basis_target: ArrayLike
 ) -> VertexMap:
-    """Recover a vertex map from a functional map, by nearest neighbors in the spectral embedding.
+    """Recover a vertex map from a functional map, by nearest neighbours in the spectral embedding.
 
     The matrix is as `VertexMap.functional` gives it: from functions on the target to functions on the source. pyFM's
     ``FM_12`` for ``mesh1`` and ``mesh2`` has ``mesh1`` as target and ``mesh2`` as source.

@@ -37,7 +37,7 @@ _OPPOSED_PENALTY = 0.15
 _OTHER_PART_PENALTY = 0.03
 # Weight of a distance on the source relative to one on the target, where a nearby point of the source is given.
 _SOURCE_WEIGHT = 0.2
-# Below this confidence, lower confidence is penalized slightly: by 1.1 % of sqrt(area) at 0, so that of parts that coincide
+# Below this confidence, lower confidence is penalised slightly: by 1.1 % of sqrt(area) at 0, so that of parts that coincide
 # the more certain one wins.
 _SURE_CONFIDENCE, _DOUBT_PENALTY = 0.5, 0.003
 # An edge of the image may be this many times as long as the source's, plus a constant.

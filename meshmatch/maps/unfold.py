@@ -1,12 +1,12 @@
 """Remove folds from maps: images of triangles that are flipped or crushed are recomputed from their surroundings.
 
 Closest points fold where the distance between a fit and its shape exceeds their radius of curvature. Three methods move the
-neighborhoods of folds in turn; only improvements are kept. *Reconstruction* finds images whose deformation gradients are
+neighbourhoods of folds in turn; only improvements are kept. *Reconstruction* finds images whose deformation gradients are
 nearest to those of the unfolded triangles around (a Poisson equation, as in Sumner and Popovic, *Deformation transfer for
 triangle meshes*, 2004), and projects them onto the target. *Smoothing* is for sharp bends, as in an armpit or between
-fingers, where gradients on one side say little about the other: images move to the mean of their neighbors, weighted by
-mean value coordinates of the source, which are positive, and back to the surface. *Flattening* maps the neighborhood and
-the part of the target under its images into one plane, where means of neighbors hardly fold and no crease is in the way;
+fingers, where gradients on one side say little about the other: images move to the mean of their neighbours, weighted by
+mean value coordinates of the source, which are positive, and back to the surface. *Flattening* maps the neighbourhood and
+the part of the target under its images into one plane, where means of neighbours hardly fold and no crease is in the way;
 the same plane gives the images of the opposite map.
 """
 
@@ -49,10 +49,10 @@ from meshmatch.shapes.faces import seam_representatives
 from meshmatch.shapes.shape import Shape
 
 # All set by hand on bodies of SCAPE, FAUST and SHREC'19.
-_POISSON_RINGS = (2,)  # width, in triangles, of the neighborhood that moves, for each round; more rounds gain little
+_POISSON_RINGS = (2,)  # width, in triangles, of the neighbourhood that moves, for each round; more rounds gain little
 _SMOOTHING_RINGS, _SMOOTHING_STEPS = (3,), 2  # the same for smoothing, and steps per round; ten gain little more
 _FLATTENING_RINGS, _FINAL_RINGS = (1, 2), (1, 2, 3)  # the same for flattening, and for its final pass on flipped faces
-_CLOSING_RINGS = 3  # holes of a neighborhood are closed within this many rings around it
+_CLOSING_RINGS = 3  # holes of a neighbourhood are closed within this many rings around it
 # Margin around images within which the target is flattened: two of its edges, plus the longest edge of an image times this.
 _MARGINS = 0.0, 0.5
 _FLIPPED_COST = 5.0  # a flipped triangle counts as much as this many crushed ones
@@ -219,7 +219,7 @@ class _Images:
         return True
 
     def smooth(self, rings: int, least: float) -> bool:
-        """Move images around all folds to means of their neighbors; False if there is nothing to do."""
+        """Move images around all folds to means of their neighbours; False if there is nothing to do."""
         rows, near = self._around_folds(rings, least)
         if not len(rows):
             return False

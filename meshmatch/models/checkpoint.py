@@ -32,7 +32,7 @@ _MIN_COLUMNS = 64  # in matrices with fewer columns, scales would take as much s
 def save_weights(state: Mapping[str, Any], path: str | Path, *, storage: str = "float16") -> str:
     """Write a state dict and return the sha256 of the file (64 hex digits). Equal states give equal files.
 
-    Values are arrays, or torch tensors on any device. "int8" quantizes the matrices of linear layers with at least 64
+    Values are arrays, or torch tensors on any device. "int8" quantises the matrices of linear layers with at least 64
     columns, and stores other matrices as float16. `ModelError` if a tensor is not finite, `OptionError` if the storage is
     unknown, `OutputError` if the file cannot be written.
     """

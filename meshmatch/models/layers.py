@@ -1,4 +1,4 @@
-"""Building blocks of the networks in torch: nearest neighbors, residual blocks, encoders and decoders.
+"""Building blocks of the networks in torch: nearest neighbours, residual blocks, encoders and decoders.
 
 Encoders map a point set to a shape code, independent of the order and the number of the points. Decoders map a code to
 the rows that parameterize a field: one displacement vector per node, or the code itself.
@@ -134,7 +134,7 @@ def residual_mlp(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequen
 
 
 def _start_near_zero(last: nn.Module) -> None:
-    """Initialize an output layer such that an untrained deformer hardly moves its template."""
+    """Initialise an output layer such that an untrained deformer hardly moves its template."""
     assert isinstance(last, nn.Linear)
     nn.init.normal_(last.weight, std=2e-3)
     nn.init.zeros_(last.bias)

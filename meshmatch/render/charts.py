@@ -174,7 +174,7 @@ def draw_dots(
             named: list[Floats] = []
             for number, name in dots.names.items():
                 at = (points[number] - low) / np.maximum(span, 1e-300)
-                below = any(np.abs(at - other).max() < 0.08 for other in named)  # keeps neighboring names apart
+                below = any(np.abs(at - other).max() < 0.08 for other in named)  # keeps neighbouring names apart
                 named.append(at)
                 about = {"textcoords": "offset points", "color": _GREY, "fontsize": 7.5}
                 about |= {"ha": "right" if at[0] > 0.5 else "left"}

@@ -143,7 +143,7 @@ def _rotation_from(upward: Direction, ahead: Direction) -> Rotation:
 
 
 def _surface_samples(shape: Shape) -> tuple[Points, Float[Floats, " N"]]:
-    """Points all over the surface, centered, in units of sqrt(area), and each one's share of the area."""
+    """Points all over the surface, centred, in units of sqrt(area), and each one's share of the area."""
     if shape.is_cloud:
         points = shape.verts[shape.valid]
         weights = np.ones(len(points))

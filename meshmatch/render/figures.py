@@ -154,7 +154,7 @@ def _shape_surface(
     colors = paint.colors if isinstance(paint, surface.VertexPaint) else _linear(None, shape.V, CLAY)
     drawn = _drawn_vertices(shape)
     drawn = drawn[:: max(1, -(-len(drawn) // MAX_POINTS))]
-    # Distance of each point to its fifth neighbor: discs of that size nearly close the surface.
+    # Distance of each point to its fifth neighbour: discs of that size nearly close the surface.
     near = cKDTree(verts[drawn]).query(verts[drawn], k=min(6, len(drawn)))[0].reshape(len(drawn), -1)
     spacing = near[:, -1] if len(drawn) > 1 else np.full(len(drawn), 0.05)
     typical = float(np.clip(np.median(spacing), 1e-3, 0.06))

@@ -1,7 +1,7 @@
 """Rendering of a scene to pixels, with one ray per pixel, and more where edges would look jagged.
 
-Visibility of the lights is computed once per pixel, filtered over neighbors on the same surface, and then shared by all rays
-of the pixel. Rows are processed in bands, so that memory does not grow with the picture.
+Visibility of the lights is computed once per pixel, filtered over neighbours on the same surface, and then shared by all
+rays of the pixel. Rows are processed in bands, so that memory does not grow with the picture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BAND = 100_000
 MAX_POINTS = 6_000_000
 """Maximum number of points along each of the three sides of all triangles."""
 _HALO = GROUND_BLOCK // 2 + 2  # rows above and below a band that its filter and its edges need
-_CONTRAST = 0.035  # sRGB difference between neighbors above which a pixel gets more rays
+_CONTRAST = 0.035  # sRGB difference between neighbours above which a pixel gets more rays
 
 
 def _lattice(count: int, step: int) -> Float[Floats, "count 2"]:
@@ -166,7 +166,7 @@ def _shifted_slices(step: int, axis: int, shape: tuple[int, int]) -> tuple[tuple
 
 
 def _has_contrast(values: Float[Floats32, "H W C"], by: float) -> Bool[Bools, "H W"]:
-    """Pixels that differ from a neighbor by more than ``by``, so that an edge may pass through them."""
+    """Pixels that differ from a neighbour by more than ``by``, so that an edge may pass through them."""
     shape = values.shape[0], values.shape[1]
     result = np.zeros(shape, bool)
     for axis in (0, 1):

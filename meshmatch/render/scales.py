@@ -226,7 +226,7 @@ def legend_height(legend: Legend, width: int, unit: float) -> int:
 
 
 def draw_legend(image: Image.Image, legend: Legend, top: int, unit: float, ink: Ink) -> None:
-    """Draw a centered legend into a picture, starting at row ``top``."""
+    """Draw a centred legend into a picture, starting at row ``top``."""
     y = top + 0.2 * unit
     if legend.title:
         text, size = fit_text(legend.title, unit, 0.94 * image.width)

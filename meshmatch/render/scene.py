@@ -237,8 +237,8 @@ def visibility(scene: Scene, hits: Hits, rows: Rows, row: Rows, column: Rows) ->
 
 def _visible_shares(scene: Scene, places: Vectors, flat: Vectors, normal: Vectors, subset: int, rays: slice) -> Shares:
     """Shares of lamp and sky at places on a surface, by the selected rays of a subset."""
-    # At grazing angles a facet shades its neighbors although the smooth surface is lit: shadows fade out there.
-    # At a grazing angle a facet shades its neighbors although the smooth surface is lit: shadows fade there.
+    # At grazing angles a facet shades its neighbours although the smooth surface is lit: shadows fade out there.
+    # At a grazing angle a facet shades its neighbours although the smooth surface is lit: shadows fade there.
     grazing = np.clip((flat @ _KEY) / np.float32(0.3), 0.0, 1.0)
     facing = np.flatnonzero((normal @ _KEY > -0.2) & (grazing > 0))
     hidden, occluded = np.zeros((2, len(places)), np.float32)

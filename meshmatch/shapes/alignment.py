@@ -1,4 +1,4 @@
-"""Position, size, unit and orientation: normalizing frames, guesses at what files do not specify, and rigid alignment.
+"""Position, size, unit and orientation: normalising frames, guesses at what files do not specify, and rigid alignment.
 
 Alignment of sampled shapes is by iterative closest points (Besl and McKay 1992) with normals, in both directions and
 with robust weights. It finds the nearest minimum, so a search starts from many rotations: the 24 rotations of a cube
@@ -32,7 +32,7 @@ Mirroring = Literal["auto", "no"]
 # maximum residual of a rotation that replaces the given orientation, relative to the latter's
 _MAX_RESIDUAL_RATIO = 0.9
 _MIN_ANGLE = 15.0  # alignments closer than this, in degrees, are treated as one
-# Height of standing people in meters; a unit is plausible if it brings the longest extent into this range.
+# Height of standing people in metres; a unit is plausible if it brings the longest extent into this range.
 _MIN_HEIGHT, _MAX_HEIGHT = 1.2, 2.2
 _MIN_SLENDERNESS = 1.0  # minimum longest extent of a person in sqrt(area): 1.1 to 1.7 in any pose
 _MAX_ROUNDING = 1e-6  # maximum effect of rounding, as a fraction of the diagonal
@@ -114,7 +114,7 @@ class Alignment:
 def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int = 1) -> list[Alignment]:
     """Rigid motions that align a target with a shape, the best first: at most `keep` for "rigid", one otherwise.
 
-    Both are centered and have one scale, and their points are in random order. "none" keeps the orientation, "near"
+    Both are centred and have one scale, and their points are in random order. "none" keeps the orientation, "near"
     refines it, "rigid" searches all orientations.
     """
     coarse = ClosestPoints(shape.thinned(200), target.thinned(300))

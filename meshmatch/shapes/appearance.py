@@ -300,7 +300,7 @@ def _suppress_stderr() -> Iterator[None]:
 
 def _rgba(image: Image.Image) -> Pixels:
     """(H, W, 4) 8-bit pixels of an image in any mode."""
-    if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray, which Pillow would clip
+    if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey, which Pillow would clip
         gray = np.asarray(image).astype(np.float64)
         maximum = 65535.0 if image.mode.startswith("I") else 1.0
         byte = np.round(255 * np.clip(np.nan_to_num(gray) / maximum, 0, 1)).astype(np.uint8)

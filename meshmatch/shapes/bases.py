@@ -57,7 +57,7 @@ def base_plane(shape: Shape) -> Plane | None:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Centered points of a surface with unit normals, whose signs mean nothing for a cloud."""
+    """Centred points of a surface with unit normals, whose signs mean nothing for a cloud."""
 
     points: Float[Floats, "P 3"]
     normals: Float[Floats, "P 3"]

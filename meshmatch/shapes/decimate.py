@@ -43,7 +43,7 @@ def decimate(shape: Shape, faces: int, quality: Quality = "fast") -> Shape:
         raise InputError(f"{shape.name or 'the shape'} is a point cloud: it has no faces to decimate")
     if faces >= shape.F:
         return shape
-    # normalized, because the library compares with absolute tolerances
+    # normalised, because the library compares with absolute tolerances
     center, size = shape.bounds.mean(axis=0), shape.diagonal or 1.0
     collapse = _by_pymeshlab if quality == "meshlab" else _fast
     verts, corners = collapse((shape.verts - center) / size, shape.faces, faces)

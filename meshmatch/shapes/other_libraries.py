@@ -1,4 +1,4 @@
-"""Meshes and clouds of other libraries as arrays, recognized by their attributes: none of the libraries is imported.
+"""Meshes and clouds of other libraries as arrays, recognised by their attributes: none of the libraries is imported.
 
 Supported are trimesh (also its scenes), Open3D, vedo, PyVista, meshio, PyMeshLab, PyTorch3D, and any object with
 vertices and faces under the usual names. Objects that connect their points in an unknown way are refused: they must not

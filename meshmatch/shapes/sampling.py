@@ -38,7 +38,7 @@ def sample_surface(shape: Shape, P: int, rng: np.random.Generator) -> Samples:
     """Draw `P` points with uniform probability per area; the same state of `rng` gives the same points.
 
     From a cloud, its own points are drawn with probability proportional to the area that each represents (so dense
-    regions are not favored), without repetition while there are enough. `InputError` if there is no area.
+    regions are not favoured), without repetition while there are enough. `InputError` if there is no area.
     """
     areas = shape.vertex_areas if shape.is_cloud else shape.face_areas
     total = np.cumsum(areas)
@@ -105,7 +105,7 @@ def _draw_points(areas: Floats, P: int, rng: np.random.Generator) -> Ints:
 def triangulate_cloud(cloud: Shape, most: int) -> tuple[Int[Ints, " V"], Int[Ints, "F 3"]]:
     """Triangulate some points of a cloud by the triangles on which their Delaunay stars in the tangent planes agree.
 
-    After the localized Delaunay triangulation of Gopi, Krishnan and Silva (*Surface Reconstruction based on Lower
+    After the localised Delaunay triangulation of Gopi, Krishnan and Silva (*Surface Reconstruction based on Lower
     Dimensional Localized Delaunay Triangulation*, 2000): a triangle is kept if it is in the stars of all three corners.
     Where noisy points make stars disagree a small hole remains; no point is moved or added.
 

@@ -1,7 +1,7 @@
 """Text tables as spreadsheets, NumPy, pandas, R and people write them, and readers and writers by suffix.
 
 The reader detects the separator of cells, whether the decimal mark is a point or a comma, and missing values. A decimal
-comma is recognized if another character separates the cells (``0,5;1,25``, also a tab or spaces), if it is in quotes,
+comma is recognised if another character separates the cells (``0,5;1,25``, also a tab or spaces), if it is in quotes,
 and in a single column whose digits cannot be a second column of whole numbers. Ambiguous tables are refused with an
 explanation.
 """

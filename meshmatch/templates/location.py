@@ -10,7 +10,7 @@ def bundled_folder() -> Path:
 
     It contains ``human/`` (template bundles), ``models/NAME/`` (trained models), ``rigs/`` (data for generated animals),
     ``measurements/`` (the reference body of measurements) and ``samples/`` (example shapes).
-    The wheel's copy takes precedence; a checkout is only recognized by its ``pyproject.toml``, so that an installed package
+    The wheel's copy takes precedence; a checkout is only recognised by its ``pyproject.toml``, so that an installed package
     never reads an unrelated ``templates/``. `TemplateError` if there is neither.
     """
     package = Path(__file__).resolve().parents[1]

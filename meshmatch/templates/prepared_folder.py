@@ -107,7 +107,7 @@ def registered_stack(
     if len(complete) < 2:
         return np.zeros((0, len(vertices), 3), np.float32)
     chosen = np.stack(complete)
-    # Centered before conversion to float32, in which coordinates far from the origin would lose precision.
+    # Centred before conversion to float32, in which coordinates far from the origin would lose precision.
     return np.asarray((chosen - chosen.mean(1, keepdims=True)).astype(np.float32))
 
 

@@ -154,7 +154,7 @@ class BatchDataset(torch.utils.data.Dataset[Batch]):
         features = torch.zeros(B, 0) if self.encoder is None else self.encoder.features(in_core)
         if self.aligner is None:
             return Batch(in_core, targets, features)
-        # The aligner sees the scan centered on its own points, in a random orientation.
+        # The aligner sees the scan centred on its own points, in a random orientation.
         middle = points.mean(1, keepdim=True)
         orientation = scans.random_rotations(B, generator)
         rotated = (points - middle) @ orientation.transpose(1, 2)

@@ -23,7 +23,7 @@ class ScanConfig:
     those that show only what is visible from outside, not surfaces inside clothes or between parts; ``strays`` of those with
     a foreign object, such as a held object, a base or a sheet.
 
-    With ``upright``, scans are in the category's own axes, centered, and rotated about the vertical axis only (as in the
+    With ``upright``, scans are in the category's own axes, centred, and rotated about the vertical axis only (as in the
     paper), or not at all without ``yaw``; otherwise they are approximately in the core frame, as an aligner leaves them.
     With ``sphere``, shapes are scaled to the template's radius around its centroid (as in the paper) instead of to area 1.
     """

@@ -57,7 +57,7 @@ class BakeOptions:
     min_confidence
         Confidence (0..1) below which a texel is not trusted.
     fill
-        Fill in such texels from their neighbors in the texture.
+        Fill in such texels from their neighbours in the texture.
     blank
         Or give them one color: sRGB and alpha, in 0..1.
     workers

@@ -40,7 +40,7 @@ _MAX_SOLID, _MAX_OPEN, _MIN_THICKNESS = 0.1, 0.6, 0.2
 _TOUCH, _OPPOSED, _SAME_PLACE, _TOGETHER, _APART = 0.004, -0.3, 0.03, 0.15, 0.4
 # Displacements below this share of the largest one become 0.
 _NEGLIGIBLE = 1e-3
-_N_NEIGHBORS, _N_AROUND = 12, 4
+_N_NEIGHBOURS, _N_AROUND = 12, 4
 
 
 def carry_moves(
@@ -128,23 +128,25 @@ def _move_rigidly(
     starts = np.cumsum(counts) - counts
     for number in np.flatnonzero(own | lost).tolist():
         inside = members[starts[number] : starts[number] + counts[number]]
-        neighbors = inside[known[inside]]
+        neighbours = inside[known[inside]]
         if lost[number] and tree is not None:
             distance, near = (np.asarray(each) for each in tree.query(target.verts[inside], min(_N_AROUND, len(rows))))
-            neighbors = rows[np.unique(near[distance <= _NEAR * length_of(target)])]
-        if len(neighbors):
-            moved[:, inside] = _rigid_displacements(target.verts[inside], target.verts[neighbors], moved[:, neighbors])
+            neighbours = rows[np.unique(near[distance <= _NEAR * length_of(target)])]
+        if len(neighbours):
+            moved[:, inside] = _rigid_displacements(
+                target.verts[inside], target.verts[neighbours], moved[:, neighbours]
+            )
 
 
 def _rigid_displacements(
-    points: Float[Floats, "N 3"], neighbors: Float[Floats, "M 3"], moves: Float[Floats32, "K M 3"]
+    points: Float[Floats, "N 3"], neighbours: Float[Floats, "M 3"], moves: Float[Floats32, "K M 3"]
 ) -> Floats32:
     """(K, N, 3) displacements of points by the rotation and translation that most points around agree on (robust fit)."""
     weight = np.ones(moves.shape[:2])
     for _ in range(5):
         share = weight / weight.sum(axis=1, keepdims=True)
-        center, shift = share @ neighbors, np.einsum("km,kmd->kd", share, moves)
-        source_points = neighbors[None] - center[:, None]
+        center, shift = share @ neighbours, np.einsum("km,kmd->kd", share, moves)
+        source_points = neighbours[None] - center[:, None]
         moved_points = source_points + moves - shift[:, None]
         left, _, right = np.linalg.svd(np.einsum("km,kmi,kmj->kij", share, moved_points, source_points))
         sign = np.ones((len(moves), 3))
@@ -176,7 +178,7 @@ def _close_slits(moved: Float[Floats32, "K V 3"], backward: VertexMap, source: S
 def _touching(shape: Shape) -> Int[Ints, " V"]:
     """(V,) the nearest vertex with an opposite normal that each vertex touches; -1 where there is none."""
     reach = _TOUCH * length_of(shape)
-    found = cKDTree(shape.verts).query(shape.verts, min(_N_NEIGHBORS, shape.V), distance_upper_bound=reach)
+    found = cKDTree(shape.verts).query(shape.verts, min(_N_NEIGHBOURS, shape.V), distance_upper_bound=reach)
     distance, nearest = (np.asarray(each).reshape(shape.V, -1) for each in found)
     row, column = np.nonzero(np.isfinite(distance))
     opposed = dot(shape.vertex_normals[row], shape.vertex_normals[nearest[row, column]]) < _OPPOSED

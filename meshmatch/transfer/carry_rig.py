@@ -4,7 +4,7 @@ Every joint follows the skin around it: its position by the similarity that take
 places on the target, its rotation by that of the skin that it moves. Nodes above all joints that move vertices stay upright
 and on the ground, at the target's scale.
 
-Where the parent of a joint moves no vertex, as of feet that hang from the root, the joint follows its neighbor on the skin
+Where the parent of a joint moves no vertex, as of feet that hang from the root, the joint follows its neighbour on the skin
 into the source's pose, and in clips.
 """
 
@@ -192,7 +192,7 @@ class _Skin:
     moves : (N,) nodes that move vertices
     body : (N,) these and their descendants
     first : topmost node of the body with the most skin below it
-    anchors : (N,) what each node of the body follows on the skin: its parent, or of a topmost one a neighbor; else -1
+    anchors : (N,) what each node of the body follows on the skin: its parent, or of a topmost one a neighbour; else -1
     order : nodes of the body, anchors first
     """
 
@@ -220,17 +220,17 @@ class _Skin:
         shared = np.zeros((len(tops), N))
         shared[:, rig.joints] = (groups @ common).toarray()
         shared[:, ~self.moves] = 0.0
-        best, neighbor = np.zeros(len(tops)), np.full(len(tops), -1)
+        best, neighbour = np.zeros(len(tops)), np.full(len(tops), -1)
         pending = set(range(len(tops))) - {int(number[self.first])}
         added = self.order
         while pending:
             nearest = shared[:, added].argmax(axis=1)
             found = shared[np.arange(len(tops)), np.array(added)[nearest]]
-            neighbor = np.where(found > best, np.array(added)[nearest], neighbor)
+            neighbour = np.where(found > best, np.array(added)[nearest], neighbour)
             best = np.maximum(best, found)
             chosen = max(pending, key=lambda k: (best[k], -k))
             pending.remove(chosen)
-            self.anchors[tops[chosen]] = neighbor[chosen]
+            self.anchors[tops[chosen]] = neighbour[chosen]
             added = np.flatnonzero(self.body & (top == tops[chosen])).tolist()
             self.order = self.order + added
 

@@ -1,6 +1,6 @@
 """Segmentation of a surface into charts: compact regions that can be flattened with little stretch.
 
-Regions are found on a decimated copy. Cells grow there from farthest-point seeds, and neighboring cells are merged as long
+Regions are found on a decimated copy. Cells grow there from farthest-point seeds, and neighbouring cells are merged as long
 as they flatten together and fill their convex hull. Each triangle of the surface then takes the region of the nearest coarse
 triangle, and regions that stretch too much are bisected. Small charts are finally merged along hinges. All attempts share a
 work budget; once it is spent, what is left becomes charts of single polygons.
@@ -30,7 +30,7 @@ from meshmatch.transfer.whole_polygons import unfold_polygon
 _COARSE_FACES = 2_000  # triangles of the decimated copy
 _MAX_SMOOTHING = 100  # steps on the surface; where more are needed, borders are first smoothed on a finer copy
 _N_CELLS = 80
-_BEND_COST = 4.0  # how much longer a path becomes where neighboring triangles face different ways
+_BEND_COST = 4.0  # how much longer a path becomes where neighbouring triangles face different ways
 _CENTERING_ROUNDS = 4  # rounds in which cells grow again from their centers
 _NOTCH_SHARE, _NOTCH_ROUNDS = 0.7, 3  # share of the angle around a vertex above which a region takes the rest
 _COPY_SMOOTHING = 3  # steps that smooth borders on the copy
@@ -40,10 +40,10 @@ _ANY_FORM_AREA = 0.004  # smaller regions may have any form
 _MAX_CRUMB_FACES = 2_500  # triangles of two charts of the surface together, up to which crumbs are merged at the end
 _CRUMB_AREA = 0.004  # smaller regions (crumbs) join whatever they can
 _MAX_CHART_AREA = 0.2
-_MAX_BAD_AREA = 0.01  # share of a region's area that may be given to its neighbors
+_MAX_BAD_AREA = 0.01  # share of a region's area that may be given to its neighbours
 _CONNECT_ROUNDS = 10  # rounds that reassign disconnected parts of regions
 _MAX_RINGS = 4  # rings of triangles around bad ones that are given away with them
-_REASSIGN_ROUNDS = 6  # rounds in which bad triangles are given to neighbors
+_REASSIGN_ROUNDS = 6  # rounds in which bad triangles are given to neighbours
 _MIN_SHARED = 0.25  # smallest share of the shorter border of two regions that merging them removes
 _TEXELS = 96, 256  # resolution of the test for self-overlap: on the copy, on the surface
 _NORMAL_WEIGHT = 0.02  # length (sqrt(area)) that a unit normal counts for in the search for the nearest triangle
@@ -208,7 +208,7 @@ def _fill_notches(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
 
 
 def _connect_regions(surface: _Surface, region: Ints, most: float = np.inf) -> Int[Ints, " F"]:
-    """Make regions connected: all but the largest part of each join the neighbor across their longest border, or become
+    """Make regions connected: all but the largest part of each join the neighbour across their longest border, or become
     regions themselves if their area is `most` or more.
     """
     one, two = (np.concatenate(ends) for ends in ((surface.face_a, surface.face_b), (surface.face_b, surface.face_a)))
@@ -253,7 +253,7 @@ def _connected_parts(surface: _Surface, region: Ints) -> Int[Ints, " F"]:
 def _split_until_flat(
     surface: _Surface, region: Ints, max_stretch: float, polygons: Ints, progress: Progress = Progress()
 ) -> list[Chart]:
-    """Split regions until each can be flattened. Small flipped or overlapping parts of a region go to its neighbors;
+    """Split regions until each can be flattened. Small flipped or overlapping parts of a region go to its neighbours;
     regions with larger ones are bisected. Reports the share of triangles that were tried at least once.
     """
     cache, tried = _LayoutCache(surface, max_stretch, polygons), set[int]()
@@ -334,14 +334,14 @@ def _add_rings(surface: _Surface, region: Ints, faces: Ints, rings: int) -> Ints
     same = region[surface.face_a] == region[surface.face_b]
     one, two = surface.face_a[same], surface.face_b[same]
     for _ in range(rings):
-        neighbors = np.zeros(len(region), bool)
-        neighbors[one[marked[two]]] = neighbors[two[marked[one]]] = True
-        marked |= neighbors
+        neighbours = np.zeros(len(region), bool)
+        neighbours[one[marked[two]]] = neighbours[two[marked[one]]] = True
+        marked |= neighbours
     return np.flatnonzero(marked)
 
 
 def _reassign(surface: _Surface, region: Ints, faces: Ints, polygons: Ints) -> Int[Ints, " F"]:
-    """Give faces, a polygon at a time, to the neighboring region across their longest border, where there is one."""
+    """Give faces, a polygon at a time, to the neighbouring region across their longest border, where there is one."""
     one, two = (np.concatenate(ends) for ends in ((surface.face_a, surface.face_b), (surface.face_b, surface.face_a)))
     length = np.concatenate([surface.length, surface.length])
     remaining = np.zeros(len(region), bool)
@@ -417,8 +417,8 @@ class _ChartMerger:
             _, one, two, *versions = heappop(self.queue)
             if [self.version[one], self.version[two]] == versions and (chart := self._merge_if_flat(one, two)):
                 self._replace(one, two, chart)
-                for neighbor in self.shared[one]:
-                    self._enqueue(min(one, neighbor), max(one, neighbor))
+                for neighbour in self.shared[one]:
+                    self._enqueue(min(one, neighbour), max(one, neighbour))
         return list(self.by_id.values())
 
     def _enqueue(self, one: int, two: int) -> None:
@@ -460,7 +460,9 @@ class _ChartMerger:
         self.area[one] += self.area[two]
         self.version[one] += 1
         self.version[two] = -1
-        for neighbor, length in self.shared.pop(two).items():
-            del self.shared[neighbor][two]
-            if neighbor != one:
-                self.shared[one][neighbor] = self.shared[neighbor][one] = self.shared[one].get(neighbor, 0.0) + length
+        for neighbour, length in self.shared.pop(two).items():
+            del self.shared[neighbour][two]
+            if neighbour != one:
+                self.shared[one][neighbour] = self.shared[neighbour][one] = (
+                    self.shared[one].get(neighbour, 0.0) + length
+                )

@@ -20,7 +20,7 @@ from meshmatch.transfer.low_confidence import replace_low_weights, vertex_graph
 # All set by hand. Smaller weights do not connect vertices to a region; regions of a joint with less than this share of its
 # largest one on the same part of a mesh are strays; a vertex that keeps less than this share of its weight is a hole.
 _MIN_CONNECTING, _MIN_REGION, _MIN_KEPT = 0.02, 0.25, 0.5
-# Neighbors with less than this share of their weights in common are a tear; steps of smoothing tears.
+# Neighbours with less than this share of their weights in common are a tear; steps of smoothing tears.
 _MIN_COMMON, _SMOOTHING_STEPS = 0.1, 3
 _MIN_WEIGHT = 1e-3  # smaller weights move nothing visibly
 # Vertices farther from the source than this, in diagonals of the target's box, have no counterpart; where more than this
@@ -34,7 +34,7 @@ def clean_weights(
     """Clean skin weights (V, J) of the target; every row sums to 1. Vertices at one position along seams get equal weights.
 
     On every connected part of the mesh each joint keeps its main regions; holes are filled in from their surroundings, and
-    neighbors with almost nothing in common are smoothed. Vertices that no joint moves take the weights of the nearest other
+    neighbours with almost nothing in common are smoothed. Vertices that no joint moves take the weights of the nearest other
     one. Weights of ``unknown`` vertices are ignored and filled in like holes.
     """
     graph = vertex_graph(target)

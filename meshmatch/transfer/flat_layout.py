@@ -30,7 +30,7 @@ _COTANGENTS = 0.02, 20.0  # limits of the weights of thin triangles
 _MIN_HEIGHT = 1e-3  # height over base: thinner triangles are laid out as if they had this one
 _MIN_VISIBLE = 0.01  # share of that area: whether a triangle with less is flipped cannot be seen
 _ZERO_LENGTH = 1e-9  # of sqrt(area): shorter edges have no length
-_UNTANGLE_ROUNDS = 6  # rounds that move the corners of flipped triangles between their neighbors
+_UNTANGLE_ROUNDS = 6  # rounds that move the corners of flipped triangles between their neighbours
 _MAX_GRID = 1024  # texels across a piece in the test for self-overlap: at most,
 _TEXELS_PER_ROW = 16  # and for each row of triangles
 _MAX_BORDER = 600  # edges of a border that are tested for crossings, each pair of them
@@ -270,7 +270,7 @@ def _factorize(values: NDArray[Any], rows: Ints, columns: Ints, selected: Bools)
 
 
 def _untangle(uv: Floats, corners: Ints) -> Floats:
-    """Move the corners of flipped triangles to the mean of their neighbors (Tutte); each round moves one ring more."""
+    """Move the corners of flipped triangles to the mean of their neighbours (Tutte); each round moves one ring more."""
     if (signed_areas(uv[corners]) > 0).all():
         return uv
     M = len(uv)

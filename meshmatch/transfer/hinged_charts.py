@@ -65,7 +65,7 @@ class _Edges:
 
 
 class HingeMerger:
-    """Greedy merging of small charts with neighbors along hinges, the pairs first that fill their common hull best."""
+    """Greedy merging of small charts with neighbours along hinges, the pairs first that fill their common hull best."""
 
     def __init__(
         self, verts: Float[Floats, "V 3"], faces: Int[Ints, "F 3"], charts: list[Chart], max_stretch: float, texels: int

@@ -1,4 +1,4 @@
-"""Treatment of results where the map has low confidence: leave them blank, or fill them in from their neighbors.
+"""Treatment of results where the map has low confidence: leave them blank, or fill them in from their neighbours.
 
 `low` (N,) marks entries of low confidence. Entries without a value, because the source has none there, are treated alike.
 """
@@ -18,7 +18,7 @@ from meshmatch.geometry.triangles import same_rows
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.attributes import NO_LABEL, largest_weights
 
-_N_NEIGHBORS = 8  # nearest neighbors of a point of a cloud
+_N_NEIGHBOURS = 8  # nearest neighbours of a point of a cloud
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def vertex_graph(shape: Shape) -> csr_array:
     position are connected, so that texture seams do not separate.
     """
     if shape.is_cloud:
-        near = cKDTree(shape.verts).query(shape.verts, min(_N_NEIGHBORS + 1, shape.V))[1].reshape(shape.V, -1)
+        near = cKDTree(shape.verts).query(shape.verts, min(_N_NEIGHBOURS + 1, shape.V))[1].reshape(shape.V, -1)
         pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].ravel()], axis=1)
     else:
         pairs = shape.edges.vertices.astype(np.int64)
@@ -65,15 +65,15 @@ def _graph(points: Floats, pairs: Ints) -> csr_array:
     return csr_array((np.tile(length, 2), tuple(places)), shape=(len(points), len(points)))
 
 
-def _with_neighbors(graph: csr_array, some: Bools) -> Ints:
-    """Indices of some nodes and their neighbors; working on these keeps the cost independent of the rest."""
+def _with_neighbours(graph: csr_array, some: Bools) -> Ints:
+    """Indices of some nodes and their neighbours; working on these keeps the cost independent of the rest."""
     return np.flatnonzero(some | (np.asarray(graph @ some.astype(np.float64)) > 0))
 
 
 def nearest_known(graph: csr_array, known: Bools) -> Ints:
     """(N,) the nearest known node of each node along the graph: itself if it is known, -1 if none can be reached."""
     nearest = np.where(known, np.arange(len(known)), -1)
-    some = _with_neighbors(graph, ~known)
+    some = _with_neighbours(graph, ~known)
     if known[some].any():
         part, begin = csr_array(graph[some][:, some]), np.flatnonzero(known[some])
         distance, _, first = dijkstra(part, indices=begin, min_only=True, return_predecessors=True)
@@ -87,7 +87,7 @@ def diffuse(graph: csr_array, known: Bools, values: Floats) -> tuple[Floats, Boo
     reaches are kept.
 
     The result is the discrete harmonic function with the known values as its boundary, solved by conjugate gradients: each
-    row is the mean of its neighbors, weighted by 1 / distance.
+    row is the mean of its neighbours, weighted by 1 / distance.
     """
     nearest = nearest_known(graph, known)
     fillable = ~known & (nearest >= 0)
@@ -142,7 +142,7 @@ def replace_low_weights(
     if not fill or not count:
         return weights, LowConfidence(N, count)
     graph = vertex_graph(target)
-    some = _with_neighbors(graph, low)  # dense rows only where they are needed
+    some = _with_neighbours(graph, low)  # dense rows only where they are needed
     dense, done = diffuse(csr_array(graph[some][:, some]), ~low[some], weights[some].toarray())
     filled = np.zeros(N, bool)
     filled[some[done]] = True

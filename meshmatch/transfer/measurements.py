@@ -34,7 +34,7 @@ _LANDMARKS = {"distance": "two landmarks or more", "girth": "three landmarks", "
 _HINT = "a row each: name,kind,landmark,landmark,...; the kinds are distance, girth and angle"
 _SPACING = 1 / 64  # maximum distance between points of a girth, as a share of it
 _MIN_SHARE = 0.75  # share of a girth that must exist
-_MAX_GAP = 1 / 5  # maximum distance between neighbors along a girth, as a share of it;
+_MAX_GAP = 1 / 5  # maximum distance between neighbours along a girth, as a share of it;
 _MAX_GAP_STEPS = 4  # or in mean distances, if that is more, where the points of a cloud are sparse
 _MIN_POINTS = 6  # points of a girth: the hull of fewer is shorter by five percent or more
 _MAX_POINTS = 3_000_000  # of all girths together
@@ -368,7 +368,7 @@ def _sample_evenly(lengths: Float[Floats, " N"]) -> tuple[Int[Ints, " M"], Float
 
 
 def _is_torn(points: Float[Floats, "N 3"], trusted: Bool[Bools, " N"], face: Int[Ints, " N"], girth: float) -> bool:
-    """Whether neighbors along a girth, which are in one face, lie far apart, as by a map that leads to another limb; or
+    """Whether neighbours along a girth, which are in one face, lie far apart, as by a map that leads to another limb; or
     whether it has too few distinct points.
     """
     pairs = np.flatnonzero((face[1:] == face[:-1]) & trusted[1:] & trusted[:-1])

@@ -1,7 +1,7 @@
 """Closest points on the source's surface, by walking over it.
 
 A search begins at a known face and moves from face to face over shared edges. Unlike a search in a tree, it never jumps to
-another sheet that merely passes nearby, and neighboring points end at neighboring places.
+another sheet that merely passes nearby, and neighbouring points end at neighbouring places.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SurfaceWalker:
         self.verts = (shape.verts - self.center) / self.unit
         self.faces = shape.faces
         self.welded = same_rows(shape.verts)[shape.faces]  # welded by position: seams do not separate
-        self.opposite, self.opposite_edge = _face_neighbors(shape.faces, self.welded)
+        self.opposite, self.opposite_edge = _face_neighbours(shape.faces, self.welded)
         corners = self.verts[shape.faces]
         self.areas = triangle_areas(self.verts, shape.faces)
         first, second = duals(corners)
@@ -128,7 +128,7 @@ class SurfaceWalker:
 
 
 class PointWalker(SurfaceWalker):
-    """The same interface for a point cloud: each point with its two nearest neighbors acts as a face, walks are
+    """The same interface for a point cloud: each point with its two nearest neighbours acts as a face, walks are
     nearest-point searches, and weights fall with the squared distance.
     """
 
@@ -168,7 +168,7 @@ def duals(corners: Floats) -> tuple[Floats, Floats]:
     return share * (c[:, None] * first - b[:, None] * second), share * (a[:, None] * second - b[:, None] * first)
 
 
-def _face_neighbors(faces: Ints, welded: Ints) -> tuple[Ints32, NDArray[np.int8]]:
+def _face_neighbours(faces: Ints, welded: Ints) -> tuple[Ints32, NDArray[np.int8]]:
     """The face across each edge (F, 3), -1 for none, and the number of the edge there; edge k is opposite to corner k.
 
     Edges are matched by vertices first, then by positions; edges of more than two faces cannot be crossed.

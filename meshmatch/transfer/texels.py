@@ -22,8 +22,8 @@ _CHUNK = 1 << 21  # texels
 _BAND = 64  # rows of an image that are processed together
 MAX_ROWS = 40_000_000
 """Maximum number of rows that all triangles cross together; coordinates with more are no atlas."""
-# Neighbors of a texel, as offsets down and to the right: direct ones before diagonal ones.
-_NEIGHBORS = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+# Neighbours of a texel, as offsets down and to the right: direct ones before diagonal ones.
+_NEIGHBOURS = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 # The four texels that become one of the next level.
 _QUADS = tuple((slice(row, None, 2), slice(column, None, 2)) for column in (0, 1) for row in (0, 1))
 _BYTE_VALUES: Floats32 = np.arange(256, dtype=np.float32)
@@ -87,7 +87,7 @@ def draw_triangles(corners: Floats, size: int) -> tuple[Ints32, int]:
 
 
 def grow(found: Ints32, steps: int) -> None:
-    """Let each free texel (-1) of (H, W) take the value of a neighbor that is not free; `steps` times, in place."""
+    """Let each free texel (-1) of (H, W) take the value of a neighbour that is not free; `steps` times, in place."""
     height, width = found.shape
     for _ in range(steps):
         known = found >= 0
@@ -95,7 +95,7 @@ def grow(found: Ints32, steps: int) -> None:
         padded = padded[:-2] | padded[1:-1] | padded[2:]
         row, column = np.nonzero((padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]) & ~known)
         values = np.full(len(row), -1, np.int32)
-        for down, right in _NEIGHBORS:
+        for down, right in _NEIGHBOURS:
             r, c = row + down, column + right
             usable = (r >= 0) & (r < height) & (c >= 0) & (c < width) & (values < 0)
             values[usable] = found[r[usable], c[usable]]
@@ -103,7 +103,7 @@ def grow(found: Ints32, steps: int) -> None:
 
 
 def borders_another(values: Ints32) -> Bools:
-    """(H, W) True for texels with a value of 0 or more that have a neighbor (not diagonal) with a different one."""
+    """(H, W) True for texels with a value of 0 or more that have a neighbour (not diagonal) with a different one."""
     out = np.zeros(values.shape, bool)
     for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         differ = (values[a] != values[b]) & (values[a] >= 0) & (values[b] >= 0)

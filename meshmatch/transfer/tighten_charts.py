@@ -82,7 +82,7 @@ class _Packing:
             self.weights = np.where(self.overlaps > 0, more, less).astype(np.float32)
         return True
 
-    def _neighbors(self, k: int, reach: int) -> list[int]:
+    def _neighbours(self, k: int, reach: int) -> list[int]:
         """Pieces whose boxes come within `reach` and the gap of this one's."""
         low, high = self.at[k] - reach - self.gap, self.at[k] + self.sizes[k] + reach + self.gap
         is_near = ((self.at < high) & (self.at + self.sizes > low)).all(axis=1)
@@ -100,7 +100,7 @@ class _Packing:
     def _overlaps(self, k: int) -> Int[Ints, " N"]:
         """Texels of each other piece within the padded image of this one."""
         found = np.zeros(len(self.images), np.int64)
-        for other in self._neighbors(k, 0):
+        for other in self._neighbours(k, 0):
             window, other_window = self._window(k, 0, other)
             found[other] = np.count_nonzero(self.padded[k][window] & self.images[other][other_window])
         return found
@@ -110,7 +110,7 @@ class _Packing:
         self.n_moves += 1
         high, wide = (int(side) for side in self.sizes[k] + 2 * (self.gap + _REACH))
         occupancy = np.zeros((high, wide), np.float32)
-        for other in self._neighbors(k, _REACH):
+        for other in self._neighbours(k, _REACH):
             window, other_window = self._window(k, _REACH, other)
             occupancy[window] += self.weights[k, other] * self.images[other][other_window]
         size, offsets = _fast_shape(high, wide), np.arange(-_REACH, _REACH + 1)

@@ -20,7 +20,7 @@ OWN = "name,kind,a,b,c\nlegs,angle,left toe,crotch,right toe\nreach,distance,lef
 
 @pytest.fixture
 def copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Shape:
-    """The body twice as large, and in millimeters."""
+    """The body twice as large, and in millimetres."""
     monkeypatch.chdir(tmp_path)
     body = load_shape(bundled_folder() / "measurements" / "body.ply")
     Path("in").mkdir()

@@ -76,8 +76,8 @@ def test_a_foot_of_inverse_kinematics_is_the_neighbour_of_the_shin_that_ends_the
     write_tube(tmp_path / "a.glb")
     rig = rigs._Character(tmp_path / "a.glb").rig
     feet = {("knee", "foot"), ("foot", "knee")}
-    assert not feet & rigs.neighbors(rig, 0.02)
-    assert feet <= rigs.neighbors(rig, 0.11)  # the shin's end lies 0.1 beyond the foot
+    assert not feet & rigs.neighbours(rig, 0.02)
+    assert feet <= rigs.neighbours(rig, 0.11)  # the shin's end lies 0.1 beyond the foot
 
 
 def test_a_shape_that_moves(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def config(field: str) -> ImplicitConfig:
 
 
 def box(half: np.ndarray, name: str = "box") -> Shape:
-    """Build a closed box, centered at the origin, with outward faces."""
+    """Build a closed box, centred at the origin, with outward faces."""
     verts = np.array(list(product((-1.0, 1.0), repeat=3))) * half
     faces = ConvexHull(verts).simplices.astype(np.int64)
     corners = verts[faces]

@@ -486,7 +486,7 @@ def test_axes_and_unit_are_the_headers_and_images_those_of_the_folder(tmp_path: 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         shape = meshmatch.load_shape(path)
-    np.testing.assert_allclose(shape.verts.max(0) - shape.verts.min(0), [1, 2, 0], atol=1e-6)  # meters, y up
+    np.testing.assert_allclose(shape.verts.max(0) - shape.verts.min(0), [1, 2, 0], atol=1e-6)  # metres, y up
     look = find_appearance(path, shape)
     assert (look is not None and look.materials[0].image is not None) is inside
     assert [str(each.message) for each in told] == (

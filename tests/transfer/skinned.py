@@ -19,7 +19,7 @@ def write_skinned_glb(path: Path, wide: bool = False) -> None:
     if wide:
         weights[0, 0] = 0.75
     more_joints, more = np.zeros((4, 4), "u1"), np.zeros((4, 4), "u1")
-    more_joints[0, 0], more[0, 0] = 1, 64  # normalized: 64 / 255
+    more_joints[0, 0], more[0, 0] = 1, 64  # normalised: 64 / 255
     arrays = [
         body,
         np.array([0, 1, 2, 1, 3, 2], "<u2"),

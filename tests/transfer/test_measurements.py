@@ -264,7 +264,7 @@ def test_a_girth_needs_a_surface_that_its_plane_cuts() -> None:
 
 
 def test_the_body_has_the_measurements_of_a_person() -> None:
-    """In meters: what its maker read off sections of the template."""
+    """In metres: what its maker read off sections of the template."""
     points = measuring_points("body")
     found = taken(points)
     assert len(found.names) == 30

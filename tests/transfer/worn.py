@@ -10,7 +10,7 @@ RADIUS, LENGTH = 0.2, 2.0
 
 
 def tube(radius: float, length: float, around: int, along: int, name: str, closed: bool = False) -> Shape:
-    """A pipe along y, centered at the origin; ``closed`` adds a fan of triangles at each end."""
+    """A pipe along y, centred at the origin; ``closed`` adds a fan of triangles at each end."""
     height, angle = np.meshgrid(np.linspace(-0.5, 0.5, along) * length, np.arange(around) * 2 * np.pi / around)
     height, angle = height.T.ravel(), angle.T.ravel()
     verts = np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], axis=1)

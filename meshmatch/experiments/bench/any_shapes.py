@@ -318,7 +318,7 @@ def cross_validate(found: _Found) -> dict[str, Any]:
 
 
 def _summary(errors: Float[Floats, " N"]) -> dict[str, Any]:
-    """Summarize errors: number of pairs, mean, median and share under `MAX_ERROR`."""
+    """Summarise errors: number of pairs, mean, median and share under `MAX_ERROR`."""
     mean, median, under = float(errors.mean()), float(np.median(errors)), float((errors < MAX_ERROR).mean())
     return {"pairs": len(errors), "mean": mean, "median": median, "under": under}
 

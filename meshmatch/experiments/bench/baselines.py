@@ -8,7 +8,7 @@ skipped, and the output says so.
 - zoomout: pyfmaps, HKS and WKS, ZoomOut from 30 to 120 eigenfunctions; meshes thinned to 10,000 triangles.
 - nricp: trimesh's non-rigid ICP, source onto target from the rigid alignment; the source thinned to 5,000 triangles.
 - meshmonk: viscoelastic registration, source onto target from the rigid alignment; both thinned to 20,000 triangles.
-- coded: 3D-CODED (--coded), its code optimized by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
+- coded: 3D-CODED (--coded), its code optimised by the Chamfer distance; ``meshmatch train --preset paper --field pointwise
   --volume 0 --arap 0 --blend 0`` trains one.
 - ours: this project, with refinement and without.
 

@@ -2,7 +2,7 @@
 
 The motion is an analytic function of position, so that the path of every point is known. The tracked points are the
 template's vertices as fitted to the first frame. The second difference of a path is what a strain curve would show as noise;
-the ideal is the second difference of the true path. Lengths are in millimeters.
+the ideal is the second difference of the true path. Lengths are in millimetres.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 
 SHRINK, TWIST, SHORTEN, SWAY = 0.22, 25.0, 0.12, 6.0
-"""Maximum contraction of the walls, twist in degrees, shortening along the axis, and sway in millimeters."""
+"""Maximum contraction of the walls, twist in degrees, shortening along the axis, and sway in millimetres."""
 COLUMNS = {
     "frames": "way", "mean": "mean:.2f", "95 %": "high:.2f", "second difference": "second:.3f", "of the truth": "times:.2f",
     "area strain": "strain:.3f",

@@ -5,7 +5,7 @@ training (squatting, cross-legged, curled up, handstands, folded forward, huggin
 back, random joint angles), naked, clothed, in skirts, or with other proportions. Half of them are remeshed, and some are
 noisy, have holes, lack a limb, or are only one half. The human model is fitted to each as `match` does it. The error is the
 mean distance between the fitted template's vertices and their true positions, over those that are on the shape, in
-centimeters for a person of 1.9 m2.
+centimetres for a person of 1.9 m2.
 
 Each body is a line of ``bodies.jsonl``, and its fit is a file in the same folder: a stopped run resumes with what is
 missing. ``--known`` resumes from saved results alone.
@@ -64,7 +64,7 @@ _POSE_COLUMNS = {
 _POSE_COLUMNS |= {"of these not poor": "not_poor:d"}
 _N_IDENTITIES, _FIRST_IDENTITY_SEED = 64, 5300
 _TRIES = 6  # poses drawn for each body; the one with the least self-penetration is used
-_STYLE_PROBABILITIES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, stretched, stylized, built of parts
+_STYLE_PROBABILITIES = (0.78, 0.12, 0.06, 0.04, 0.0)  # plain, child, stretched, stylised, built of parts
 # Mean angles in degrees, in the order of the fields of `Limbs`: alternatives for an arm (elevation, azimuth, twist, elbow,
 # pronation), alternatives for a leg (hip flexion, abduction, twist, knee, ankle), and the spine (flexion, side, twist).
 _HANG, _AHEAD, _UP = (12, 10, 0, 8, 10), (85, 88, 0, 15, 10), (172, 40, -60, 8, 0)
@@ -148,7 +148,7 @@ class People:
         return Body(moved, unit * verts @ turn.T, kept(verts, np.arange(len(verts))), words)
 
     def _draw_verts(self, pose: str, rng: np.random.Generator, generator: torch.Generator) -> tuple[Floats, str]:
-        """Draw vertices in meters; return them with a description of style and clothing."""
+        """Draw vertices in metres; return them with a description of style and clothing."""
         figure, rig = self.figure, self.figure.rig
         rest, heads = draw_identities(rig, 1, generator)
         style = draw_style(1, generator, _STYLE_PROBABILITIES)
@@ -239,7 +239,7 @@ def measure_fit(body: Body, fit: Fit, template: Template) -> dict[str, Any]:
 
 
 def band_of(error: float) -> str:
-    """Return the name of the band that contains an error in centimeters."""
+    """Return the name of the band that contains an error in centimetres."""
     low = max((limit for limit in BANDS if error >= limit), default=0.0)
     return f"over {low:g} cm" if low == BANDS[-1] else f"{low:g} to {BANDS[BANDS.index(low) + 1 if low else 0]:g} cm"
 
@@ -254,7 +254,7 @@ def count_by_error(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def summarize_by_pose(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Summarize errors by pose, with the number of fits over 8 cm that are not called poor."""
+    """Summarise errors by pose, with the number of fits over 8 cm that are not called poor."""
     found = []
     for pose in POSES:
         some = [

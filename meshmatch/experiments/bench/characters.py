@@ -1,7 +1,7 @@
-"""People in clothes, stylized characters and people in self-contact, none of them seen in training.
+"""People in clothes, stylised characters and people in self-contact, none of them seen in training.
 
 They are generated, so that the true map is known. The error is the geodesic distance, on the naked target body below the
-clothes, between the matched point and the true one, at every twentieth vertex of the body, in centimeters at 1.9 m2 of
+clothes, between the matched point and the true one, at every twentieth vertex of the body, in centimetres at 1.9 m2 of
 skin. "same bone" is the share of vertices whose partner follows the same bone. A pair with a mean error over 8 cm is wrong.
 Every ordered pair of a group counts, matched as `match` does it, in random orientations. Seconds are CPU time: two fits and
 the map.
@@ -34,7 +34,7 @@ from meshmatch.templates.template import read_template
 KINDS = {"clothed": PLAIN, "children": CHILD, "stylised": TOON, "built": BUILT}
 CONTACTS = {"touching": False, "fused": True}  # whether surfaces in contact are fused
 GROUPS = (*KINDS, *CONTACTS)
-_WRONG_CM = 8.0  # mean error in centimeters above which a pair is wrong
+_WRONG_CM = 8.0  # mean error in centimetres above which a pair is wrong
 _STRIDE = 20  # errors are measured at every 20th vertex of the body
 COLUMNS = {
     "group": "group", "pairs": "pairs:d", "mean cm": "mean_cm:.2f", "median": "median_cm:.2f", "worst": "worst_cm:.1f",
@@ -45,7 +45,7 @@ COLUMNS = {
 
 
 def measure_pair(source: Character, target: Character, found: VertexMap, cache: Path | None) -> dict[str, float]:
-    """Return the error in centimeters on the naked body, and the share of vertices mapped to the same bone."""
+    """Return the error in centimetres on the naked body, and the share of vertices mapped to the same bone."""
     known = np.arange(0, target.body.V, _STRIDE)
     at = np.flatnonzero(source.places % _STRIDE == 0)
     rows = TruthDistances(target.body, known, cache).of(source.places[at] // _STRIDE)

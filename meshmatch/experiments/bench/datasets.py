@@ -97,7 +97,7 @@ def check_shapes(name: str, layout: Layout, folder: Path) -> dict[str, Any]:
 
 
 def row_of(shapes: Collection[Shape], truth: str) -> dict[str, Any]:
-    """Summarize shapes: their number, and the ranges of their vertices and faces."""
+    """Summarise shapes: their number, and the ranges of their vertices and faces."""
     sizes = {"vertices": _range(each.V for each in shapes), "faces": _range(each.F for each in shapes)}
     return {"shapes": len(shapes), **sizes, "truth": truth}
 

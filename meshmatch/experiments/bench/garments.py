@@ -5,7 +5,7 @@ that family is exact; in another pose a vertex follows the joints as its triangl
 rest pose, in which garments are bound, and in a random pose. The garments of each person are transferred to the next one,
 whose body is remeshed.
 
-The error is the distance of each vertex from its position in the exact refit, in centimeters. "under the skin" counts
+The error is the distance of each vertex from its position in the exact refit, in centimetres. "under the skin" counts
 vertices inside the target that are not inside the source; the exact refit has such vertices too. ``--exact-map`` transfers
 by the true map instead of a match, which leaves the errors of the transfer alone.
 """
@@ -79,7 +79,7 @@ class Bound:
         return cls(mesh, corners, table[:, 3:6], table[:, 6:], known)
 
     def refit(self, base: Floats) -> Shape:
-        """Refit the garment to a base mesh (V, 3) at rest, in meters."""
+        """Refit the garment to a base mesh (V, 3) at rest, in metres."""
         axes = enumerate(self.scales)  # offsets and sizes are in decimeters: the result has the unit of the base mesh
         stretch = np.array([abs(base[a, k] - base[b, k]) / size for k, (a, b, size) in axes])
         return self._with(np.einsum("nk,nkd->nd", self.weights, base[self.corners]) + self.offsets * stretch)
@@ -129,7 +129,7 @@ def body_of(base: Floats, faces: Ints, name: str, cut: bool) -> Shape:
 def measure_garment(
     garment: Bound, source: Person, target: Person, pose: Pose, found: VertexMap, bodies: tuple[Shape, Shape]
 ) -> Any:
-    """Transfer a garment; return distances from the exact refit, in centimeters, and masks of vertices under the skin."""
+    """Transfer a garment; return distances from the exact refit, in centimetres, and masks of vertices under the skin."""
     worn, true = source.worn_shape(garment, "rest"), target.worn_shape(garment, pose)
     carried = carry_garment(worn, found, *bodies)
     out = ~inside(bodies[0], worn.verts)
@@ -154,7 +154,7 @@ def inside(body: Shape, points: Floats) -> Bools:
 def rows_of(
     garments: dict[str, Bound], pose: Pose, count: int, matcher: Matcher | None, seed: int
 ) -> list[dict[str, Any]]:
-    """Compute a row for each garment and one for all together, over all pairs of neighbors in a circle of people.
+    """Compute a row for each garment and one for all together, over all pairs of neighbours in a circle of people.
 
     Without a matcher, garments are transferred by the true map.
     """

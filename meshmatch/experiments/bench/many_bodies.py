@@ -3,7 +3,7 @@
 Generated people that training did not use, in poses of the training distribution, with all vertices of the body model, are
 decimated to about 7,000 vertices and rotated at random. They are fitted by `Matcher.fit_all`, fifty at a time, with the
 full search and the quick one. The error is the mean distance between the fitted template's vertices and their true
-positions, in centimeters for a person of 1.9 m2. CPU seconds are those of all threads; generating bodies is not counted.
+positions, in centimetres for a person of 1.9 m2. CPU seconds are those of all threads; generating bodies is not counted.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def bodies(template: Template, count: int, seed: int) -> Iterator[list[Body]]:
 
 
 def error_of(fit: Fit, places: Float[Floats, "V 3"], template: Template) -> float:
-    """Compute the mean error of a fit in centimeters."""
+    """Compute the mean error of a fit in centimetres."""
     unit = CM_PER_UNIT / np.sqrt(Shape(places, template.shape.faces).area)
     return float(unit * np.linalg.norm(fit.points_in_file - places, axis=1).mean())
 

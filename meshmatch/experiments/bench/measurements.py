@@ -5,7 +5,7 @@ person bounds the errors of maps. The effect of the poses themselves is given fo
 from the first pose of each person to the others by the true correspondences, which are rounded to vertices. Shoulders and
 bent hands really change.
 
-Values are in centimeters, on bodies scaled to 1.9 square meters of skin. A spread is the standard deviation within a
+Values are in centimetres, on bodies scaled to 1.9 square metres of skin. A spread is the standard deviation within a
 person over poses, pooled over people and over left and right.
 """
 

@@ -1,7 +1,7 @@
 """Methods that the benchmark measures: their interface, this project, and methods of other libraries.
 
 Methods without a category model that deform one shape onto the other start from the same rigid alignment: both shapes are
-scaled to area 1 and centered, and all orientations are tried (`shapes.align`). An error of a library on a pair becomes an
+scaled to area 1 and centred, and all orientations are tried (`shapes.align`). An error of a library on a pair becomes an
 `InputError`, a failure of that pair; other exceptions are raised.
 """
 
@@ -43,7 +43,7 @@ from meshmatch.shapes.shape import Shape
 
 _SAMPLES = 2400
 MONK_UNIT = 100.0
-"""Value of sqrt(area) for meshmonk, whose defaults are meant for faces in millimeters."""
+"""Value of sqrt(area) for meshmonk, whose defaults are meant for faces in millimetres."""
 
 
 class Method(Protocol):
@@ -145,7 +145,7 @@ def in_frame(shape: Shape, frame: Frame) -> Shape:
 def coded(model: str, steps: int = 2000, seed: int = 0) -> OurMethod:
     """Return 3D-CODED as a method: the code is refined by the Chamfer distance alone.
 
-    ``model`` was trained by ``meshmatch train --preset paper --field pointwise`` without regularization (``--volume 0
+    ``model`` was trained by ``meshmatch train --preset paper --field pointwise`` without regularisation (``--volume 0
     --arap 0 --blend 0``).
     """
     latent = replace(LatentRefineConfig(steps=steps), volume=0.0, arap=0.0)
@@ -154,7 +154,7 @@ def coded(model: str, steps: int = 2000, seed: int = 0) -> OurMethod:
 
 @dataclass(frozen=True, eq=False)
 class NormalizedShape:
-    """A centered shape of area 1, a decimated copy of it (``thin``; the same if not decimated), and samples."""
+    """A centred shape of area 1, a decimated copy of it (``thin``; the same if not decimated), and samples."""
 
     whole: Shape
     thin: Shape

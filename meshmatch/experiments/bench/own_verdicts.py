@@ -131,7 +131,7 @@ class SingleFits:
 
 
 def fit_weights(values: Float[Floats, "N 2"], right: Bool[Bools, " N"], ridge: float = 0.002) -> Weights:
-    """Fit weights by ridge-regularized logistic regression; larger features never improve a verdict."""
+    """Fit weights by ridge-regularised logistic regression; larger features never improve a verdict."""
     deviation = values.std(0) + 1e-9
 
     def loss(p: Floats) -> float:

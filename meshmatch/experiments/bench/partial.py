@@ -5,7 +5,7 @@ Each source is one of two kinds of parts of a shape of the benchmark; the target
 - view: the faces visible to a distant camera in a random direction, by ray casting;
 - cut: the faces on one side of a plane perpendicular to a random direction, between 50 and 90 % of the faces.
 
-Errors are geodesic, in centimeters at 1.9 m2 of skin, at the remaining landmarks of the source; their mean is over pairs.
+Errors are geodesic, in centimetres at 1.9 m2 of skin, at the remaining landmarks of the source; their mean is over pairs.
 The AUC is the area under the ROC curve of confidence as a predictor of errors below 15 cm; 0.5 is chance. --partial auto is
 what `meshmatch match` does; with no, sources are fitted as whole shapes.
 """

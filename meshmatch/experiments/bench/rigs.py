@@ -7,12 +7,12 @@ Every ordered pair of a folder of rigged files is transferred by `transfer_rig`,
   without joints in its ears cannot give them to another.
 - or a neighbour: the same, but a parent, a child, a sibling, or a joint at the end of one of its bones is also right (feet
   of inverse kinematics are children of the root). Two baseline methods, from the same alignment, are measured by this.
-- joints: distances of joints that move vertices in both rigs from their true positions, in centimeters with the target's
+- joints: distances of joints that move vertices in both rigs from their true positions, in centimetres with the target's
   longest side scaled to 1.8 m.
 - joints off the bone: distances of joints from the bones that meet at the true joint; small for joints that are only
   shifted along a bone.
 - in motion: each rig moves the target by its own clip of running or swimming, or else into a sitting pose. The volume that
-  is kept, and the share of vertices over a centimeter further from the bones of their joint than at rest, by the new rig
+  is kept, and the share of vertices over a centimetre further from the bones of their joint than at rest, by the new rig
   and by the target's own.
 """
 
@@ -74,7 +74,7 @@ class _Character:
         self.weights: SkinWeights = load_weights(path, self.shape)
         self.places = dict(zip(self.rig.names, self.rig.worlds()[:, :3, 3], strict=True))
         self.above = _parents(self.rig)
-        self.near = neighbors(self.rig, _TOUCHING_DISTANCE * float(np.ptp(self.shape.bounds, axis=0).max()))
+        self.near = neighbours(self.rig, _TOUCHING_DISTANCE * float(np.ptp(self.shape.bounds, axis=0).max()))
 
     def nearest_shared(self, name: str, shared: set[str]) -> str:
         """Return the joint or its nearest ancestor that is in ``shared``; "" if there is none."""
@@ -101,10 +101,10 @@ def _parents(rig: Rig) -> dict[str, str]:
     return {name: rig.names[parent] if parent >= 0 else "" for name, parent in zip(rig.names, rig.parents, strict=True)}
 
 
-def neighbors(rig: Rig, touching: float) -> set[tuple[str, str]]:
-    """Find pairs of neighboring joints, in both orders.
+def neighbours(rig: Rig, touching: float) -> set[tuple[str, str]]:
+    """Find pairs of neighbouring joints, in both orders.
 
-    A joint is a neighbor of itself, its parent, children and siblings, and of joints within ``touching`` of the end of one
+    A joint is a neighbour of itself, its parent, children and siblings, and of joints within ``touching`` of the end of one
     of its bones.
     """
     above, places = _parents(rig), rig.worlds()[:, :3, 3]

@@ -116,7 +116,7 @@ def joined_errors(several: Iterable[Errors]) -> Errors:
 
 
 def summary(errors: Sequence[Errors]) -> dict[str, float]:
-    """Summarize the errors of pairs in centimeters: mean and median over points, median over pairs, lost points, flips."""
+    """Summarise the errors of pairs in centimetres: mean and median over points, median over pairs, lost points, flips."""
     joined, means = joined_errors(errors), [each.mean_cm for each in errors]
     return {
         "mean_cm": joined.mean_cm,
@@ -150,7 +150,7 @@ class SetScores:
 
     @property
     def means_cm(self) -> dict[Pair, float]:
-        """Mean error of each pair in centimeters, in descending order."""
+        """Mean error of each pair in centimetres, in descending order."""
         means = {pair: errors.mean_cm for pair, errors in self.errors.items()}
         return dict(sorted(means.items(), key=lambda item: -item[1]))
 
@@ -185,7 +185,7 @@ class SetScores:
 def evaluate_set(
     bench: BenchSet, maps: Mapping[Pair, ArrayLike], *, pairs: Sequence[Pair] | None = None, cache: Path | None = None
 ) -> SetScores:
-    """Compute errors of maps on a set, at the source's landmarks: geodesic on meshes, Euclidean in meters on clouds.
+    """Compute errors of maps on a set, at the source's landmarks: geodesic on meshes, Euclidean in metres on clouds.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ are given:
 - ``faust``: ``tr_reg_NNN.landmarks.npy`` (5000,) vertex ids; all ordered pairs, in the groups same subject and
   cross subject. Ten consecutive numbers are one subject.
 
-- ``faust-outliers``: row i of every cloud of ``faust_outliers.npy``, (30, 1000, 3) in meters. Many points are not on the
+- ``faust-outliers``: row i of every cloud of ``faust_outliers.npy``, (30, 1000, 3) in metres. Many points are not on the
   surface; all of them count. There is no mesh, so errors are Euclidean.
 
 ``scape-pcn`` is ``scape`` as the paper's *PC+N*: methods get only the vertices, with Gaussian noise of 1 % of the bounding

@@ -116,7 +116,7 @@ def nearest_and_inpainted(
 
 
 def _inpaint_weights(target: Shape, twin: Ints, known: Bools, values: csr_array) -> csr_array:
-    """Keep known weights and solve for the others by minimizing the bi-Laplacian energy."""
+    """Keep known weights and solve for the others by minimising the bi-Laplacian energy."""
     first, place = np.unique(twin, return_inverse=True)
     faces = place[target.faces]
     held, dense = known[first], values[first].toarray()

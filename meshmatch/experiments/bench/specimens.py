@@ -4,7 +4,7 @@ The specimens of a set are rotated at random and triangulated independently. In 
 image, and the last two femurs are cut by a plane. Ground truth: femurs are in correspondence, as are molars, leaves and
 knees, which are generated (`meshmatch.experiments.makers.molars_and_leaves`); hearts share vertices of the mesh that they
 were decimated from; busts and birds have keypoints, up to the symmetries of their class. Errors are over all ordered pairs:
-Euclidean in millimeters, or geodesic in percent of sqrt(area) where there is no unit. A point is lost beyond a tenth of
+Euclidean in millimetres, or geodesic in percent of sqrt(area) where there is no unit. A point is lost beyond a tenth of
 sqrt(area).
 
 - none: ``fit FOLDER --model none``.

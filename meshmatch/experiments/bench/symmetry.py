@@ -7,7 +7,7 @@ tenth of sqrt(area).
 - none: ``fit FOLDER --model none``; the symmetry map of the template is transferred to each shape.
 - alone: ``symmetry SHAPE`` of each single shape.
 - pyclarcs: ``clarcs asymmetry`` of each single shape: its plane of symmetry and its registration of the mirror image, with
-  4,000 triangles. Its kernel widths are meant for endocasts in millimeters, so shapes are scaled to that size.
+  4,000 triangles. Its kernel widths are meant for endocasts in millimetres, so shapes are scaled to that size.
 
 With the ``--work`` folder of `meshmatch.experiments.bench.specimens` its fits are reused.
 """

@@ -1,7 +1,7 @@
 """Wrapping an artist's topology onto other bodies, compared with the exact refit.
 
 MakeHuman's alternative topologies (`.proxy`) bind each vertex to a triangle of its base mesh. The mesh of each generated
-person is wrapped onto the next one, at rest and in a pose, whose remeshed body is the scan. Distances are in centimeters: of
+person is wrapped onto the next one, at rest and in a pose, whose remeshed body is the scan. Distances are in centimetres: of
 each vertex from its position in the exact refit, and from the scan's surface; the exact refit is not exactly on it either.
 """
 

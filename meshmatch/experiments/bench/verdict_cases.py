@@ -34,7 +34,7 @@ from meshmatch.templates.template import Template, read_template
 
 _N_BODIES = 200
 MAX_EXTENT = 1.7
-"""Longest side of shapes other than people, in meters."""
+"""Longest side of shapes other than people, in metres."""
 LIMBS = (
     ("left thigh", "left shin", "left foot"), ("right thigh", "right shin", "right foot"),
     ("left upper arm", "left forearm", "left hand"), ("right upper arm", "right forearm", "right hand"),
@@ -48,7 +48,7 @@ LIMBS = (
 CAMERAS, MIN_VIEWS = 8, 2
 """Number of cameras around a scanned body, and of those that must see a face."""
 NOISE = 0.0015  # standard deviation in scans, as a fraction of the bounding box's diagonal: 3 mm on a person
-_HEIGHTS = (-0.15, 0.45)  # y of the cameras' directions before normalization, alternating: from below and from above
+_HEIGHTS = (-0.15, 0.45)  # y of the cameras' directions before normalisation, alternating: from below and from above
 
 
 def camera_directions(cameras: int = CAMERAS) -> Float[Floats, "C 3"]:
@@ -93,7 +93,7 @@ def concatenate(shape: Shape, other: Shape, at: Float[Floats, "W 3"]) -> Shape:
 
 
 def grid(side: float, cells: int) -> Shape:
-    """Build a square in the plane y = 0, centered at the origin."""
+    """Build a square in the plane y = 0, centred at the origin."""
     x, z = np.meshgrid(*[np.linspace(-0.5 * side, 0.5 * side, cells + 1)] * 2, indexing="ij")
     corner = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, 1:].ravel(), corner[1:, :-1].ravel()
@@ -325,7 +325,7 @@ class Cases:
         return self._character(number, PLAIN)
 
     def _stylised(self, number: int, rng: np.random.Generator) -> tuple[Shape, Ints]:
-        """Return a stylized person or a child, by turns."""
+        """Return a stylised person or a child, by turns."""
         return self._character(number, (TOON, CHILD)[number % 2])
 
     def _character(self, number: int, kind: int) -> tuple[Shape, Ints]:

@@ -2,13 +2,13 @@
 
 Each case (`meshmatch.experiments.bench.verdict_cases`) is matched to one of 24 targets: other people (or animals) in other
 poses, every fourth of which is cut. The error of a vertex is the Euclidean distance on the target between its partner and
-the true one, in centimeters for a person of 1.9 m2. A map's error is the mean over the vertices with a true partner, and
+the true one, in centimetres for a person of 1.9 m2. A map's error is the mean over the vertices with a true partner, and
 infinite for shapes of other kinds. A map is right below 5 cm and wrong above 8 cm. Confidence is compared, at every vertex,
 with how often the error is within 5 cm; a vertex without a true partner counts as wrong. All maps have the same weight,
 whatever their number of vertices. The longest fit is in CPU seconds.
 
 ``--fit`` prints the weights that best separate right from wrong maps of this run, in the form of
-`meshmatch.fitting.judge.calibration`; those of other kinds are regularized towards those of people. Measure verdicts with
+`meshmatch.fitting.judge.calibration`; those of other kinds are regularised towards those of people. Measure verdicts with
 other seeds than those that the calibration names.
 """
 
@@ -122,7 +122,7 @@ def measure_case(case: Case, target: Target, matcher: Matcher) -> dict[str, Any]
 
 
 def _cm_per_unit(target: Target) -> float:
-    """Return centimeters per unit of the target's file, scaled to a person of 1.9 m2."""
+    """Return centimetres per unit of the target's file, scaled to a person of 1.9 m2."""
     return CM_PER_UNIT / float(np.sqrt(Shape(target.places, np.asarray(target.fit.faces)).area))
 
 
@@ -157,7 +157,7 @@ def calibration(found: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]
 
 
 def rows_of(found: Sequence[Mapping[str, Any]], group: str, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarize maps by the value of a column: numbers of each verdict, of right and of wrong maps, and errors."""
+    """Summarise maps by the value of a column: numbers of each verdict, of right and of wrong maps, and errors."""
     rows = []
     for name in names:
         some = [each for each in found if each[group] == name]

@@ -1,10 +1,10 @@
-"""Make the reference body of ``meshmatch measure body``: the template of ``human`` in meters, standing on the floor, with
+"""Make the reference body of ``meshmatch measure body``: the template of ``human`` in metres, standing on the floor, with
 landmarks and measurements.
 
     python -m meshmatch.experiments.makers.body_measurements -o templates/measurements
 
 A landmark is the point where a ray from inside the body leaves it, or the outermost vertex of a part. The origins of the
-rays, in centimeters, were chosen from cross sections. Girths are those of tailoring and anthropometry (most are in
+rays, in centimetres, were chosen from cross sections. Girths are those of tailoring and anthropometry (most are in
 ISO 8559-1), at positions chosen on the template: where it is narrowest between ribs and hips, widest around seat and calf,
 and so on.
 """
@@ -26,8 +26,8 @@ from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.tables import write_rows
 
-_SKIN_AREA = 1.9  # square meters
-# Origin of each ray in centimeters (x to the body's left, y up from the floor, z ahead), and its direction.
+_SKIN_AREA = 1.9  # square metres
+# Origin of each ray in centimetres (x to the body's left, y up from the floor, z ahead), and its direction.
 _MIDDLE = {
     "forehead": ((0, 168, 3), (0, 0, 1)),
     "chin": ((0, 155, 3), (0, 0, 1)),
@@ -92,7 +92,7 @@ def _landmarks(body: Shape) -> dict[str, Float[Floats, " 3"]]:
 
 
 def _exit_point(body: Shape, start: ArrayLike, direction: ArrayLike) -> Float[Floats, " 3"]:
-    """First intersection of the body's surface with a ray from a point inside it, given in centimeters."""
+    """First intersection of the body's surface with a ray from a point inside it, given in centimetres."""
     corners = body.verts[body.faces]
     origin, ray = np.asarray(start) / 100.0, np.asarray(direction, np.float64)
     matrices = np.stack(

@@ -24,7 +24,7 @@ from meshmatch.fitting.search.task import Registration, without_interior
 from meshmatch.fitting.search.visibility import visible_vertices
 from meshmatch.fitting.solve.regularity import Regularity
 
-_SKIN = 1.9  # area of an adult's skin in square meters
+_SKIN = 1.9  # area of an adult's skin in square metres
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -87,7 +87,7 @@ class Motions:
 
 
 def _affine(source: Floats, goal: Floats, weights: Floats, near: Floats) -> tuple[Floats, Floats]:
-    """Weighted least-squares affine motion, regularized towards the rotation in ``near``."""
+    """Weighted least-squares affine motion, regularised towards the rotation in ``near``."""
     U, _, Vh = np.linalg.svd(near)
     lifted = np.hstack([source, np.ones((len(source), 1))])
     held = np.diag([1e-3, 1e-3, 1e-3, 0]) * weights.sum()

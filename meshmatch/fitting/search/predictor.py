@@ -36,14 +36,14 @@ TYPICAL_SPREAD = 0.03  # assumed for fits that no network predicts (units of sqr
 # trained on tilted input, and `spread` is ignored; models that ship have 0.008 at most.
 _MAX_TILT_DEVIATION = 0.02
 _BATCH = 24  # clouds per call of the network: larger batches are no faster, and take memory
-# Cost of a share near 0 over a share of 1, which favors the whole over a part. Set by hand.
+# Cost of a share near 0 over a share of 1, which favours the whole over a part. Set by hand.
 _SHARE_COST = 0.004
 # Exchanges left and right in the template frame, where bodies face along z and stand along y.
 _FLIP = np.array([-1.0, 1.0, 1.0])
 # A template is symmetric if every mirrored vertex is this near to another one (units of sqrt(area)). Set by hand.
 _MAX_ASYMMETRY = 0.01
 _RANKING_STRIDE = 4  # see `ranking_residual`
-_RIDGE = 1e-6  # regularization of the least squares, relative to the mean diagonal
+_RIDGE = 1e-6  # regularisation of the least squares, relative to the mean diagonal
 
 Residual = Callable[[NodeSystem, OrientedPoints, Float[Floats, "K 3"]], float]
 """Residual of samples in the core frame and node vectors (K, 3)."""

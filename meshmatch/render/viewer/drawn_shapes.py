@@ -43,7 +43,7 @@ class Drawn:
 
     @property
     def radius(self) -> float:
-        """Half the median distance to the fifth neighbor, for balls that nearly touch; 0 for triangles."""
+        """Half the median distance to the fifth neighbour, for balls that nearly touch; 0 for triangles."""
         if len(self.faces) or len(self.verts) < 2:
             return 0.0
         some = self.verts[:: max(1, len(self.verts) // 2_000)]

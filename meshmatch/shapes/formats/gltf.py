@@ -382,7 +382,7 @@ class Document:
         return int(self.json["accessors"][number]["count"])
 
     def accessor(self, number: int, whole: bool = False) -> Float[Floats, "count width"]:
-        """(count, width) values of an accessor; normalized integers are scaled to 0..1 or -1..1 unless `whole`."""
+        """(count, width) values of an accessor; normalised integers are scaled to 0..1 or -1..1 unless `whole`."""
         accessor = self.json["accessors"][number]
         count, width = int(accessor["count"]), WIDTHS[accessor["type"]]
         kind = np.dtype(COMPONENTS[accessor["componentType"]])

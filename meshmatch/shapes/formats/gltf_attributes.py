@@ -39,7 +39,7 @@ def read_coordinates(path: Path, data: bytes, _: Shape) -> Float[Floats, "F 3 2"
 
 
 def read_skin(path: Path, data: bytes) -> tuple[csr_array, tuple[str, ...]]:
-    """Read the positive skin weights, (vertices, joints) and not normalized, and the unique names of the joints.
+    """Read the positive skin weights, (vertices, joints) and not normalised, and the unique names of the joints.
 
     The joints of all skins form one list, in the file's node order. An unskinned mesh below a joint, such as a sword in
     a hand, gets weight 1 for that joint. `InputError` if the file is damaged or has no skin.

@@ -93,7 +93,7 @@ def decompress(
             table = values.astype(COMPONENTS[accessor["componentType"]]).reshape(accessor["count"], -1)
             accessor.pop("byteOffset", None)
             accessor["bufferView"] = len(views)
-            if "min" in accessor and len(table):  # quantization has changed the bounds
+            if "min" in accessor and len(table):  # quantisation has changed the bounds
                 accessor |= {"min": table.min(0).tolist(), "max": table.max(0).tolist()}
             views.append(new_buffer.append(table.tobytes()))
     for primitive in primitives:

@@ -207,7 +207,7 @@ def _clips(document: Document, index_of: dict[int, int]) -> tuple[Clip, ...]:
             n_keys = len(times) * (3 if interpolation == "CUBICSPLINE" else 1)
             if interpolation not in _INTERPOLATIONS or not len(times) or values.shape != (n_keys, _WIDTHS[moves]):
                 raise ValueError(f"a channel of animation {number} has {values.shape} values for {len(times)} times")
-            if moves == "rotation" and interpolation != "CUBICSPLINE":  # quantized quaternions are not of unit length
+            if moves == "rotation" and interpolation != "CUBICSPLINE":  # quantised quaternions are not of unit length
                 values = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-30)
             if not (np.abs(values) < _MAX_VALUE).all() or not (np.abs(times) < _MAX_VALUE).all():
                 raise ValueError(f"animation {number} holds what is not a number")

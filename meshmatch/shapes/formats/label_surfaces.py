@@ -1,4 +1,4 @@
-"""Extract the surfaces of labeled voxels by surface nets (Gibson, MICCAI 1998).
+"""Extract the surfaces of labelled voxels by surface nets (Gibson, MICCAI 1998).
 
 Each cell between eight voxel centers that are neither all inside nor all outside has one vertex: the mean of the points
 where the surface crosses the cell's edges, smoothed without leaving the cell. On balls of radius 5 to 30 voxels, vertices
@@ -29,7 +29,7 @@ _MAX_BOX_VOXELS = 4 << 30  # total number of voxels in the bounding boxes of all
 _BOX_BYTES = 8  # additional memory per voxel in the bounding box of a label
 _STEP_SIZES = 4 * (0.7, -0.73)  # alternating smoothing steps, which avoid shrinkage (Taubin 1995)
 _MAX_LABELS = 1000
-# Maximum share of differing neighbors, among voxels that are not 0: labels form regions, gray values do not.
+# Maximum share of differing neighbours, among voxels that are not 0: labels form regions, grey values do not.
 _MAX_CHANGES = 0.5
 _SEGMENT_FIRST = "segment it first, such as in 3D Slicer, and save the label map"
 
@@ -58,7 +58,7 @@ def label_surfaces(
     Raises
     ------
     InputError
-        The voxels are gray values, there is no label, or the surfaces would be too large for the size of the file.
+        The voxels are grey values, there is no label, or the surfaces would be too large for the size of the file.
     """
     from scipy import ndimage  # imported late, since other formats do not need it
 
@@ -110,7 +110,7 @@ def label_surfaces(
 
 
 def _labels_of(name: str, voxels: NDArray[Any]) -> NDArray[Any]:
-    """0 and all labels that occur, sorted; `InputError` if the voxels are gray values."""
+    """0 and all labels that occur, sorted; `InputError` if the voxels are grey values."""
     labels: set[Any] = {0}
     pairs = changes = 0
     for slab in _slabs(voxels):
@@ -181,15 +181,15 @@ def _surface_net(inside: Bool[Bools, "X Y Z"]) -> tuple[Float[Floats, "V 3"], In
 
 
 def _smooth(verts: Float[Floats, "V 3"], quads: Int[Ints, "N 4"], cells: Int[Ints, "V 3"]) -> Float[Floats, "V 3"]:
-    """Smooth vertices by alternating steps towards and away from the mean of their neighbors, each within its cell."""
+    """Smooth vertices by alternating steps towards and away from the mean of their neighbours, each within its cell."""
     from scipy.sparse import csr_array
 
     sides = np.concatenate([quads[:, [k, (k + 1) % 4]] for k in range(4)])
     pairs = np.concatenate([sides, sides[:, ::-1]])
-    neighbors = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(verts), len(verts)))
-    neighbors.data[:] = 1.0
-    n_neighbors: Floats = np.asarray(neighbors.sum(axis=1))[:, None]
+    neighbours = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(verts), len(verts)))
+    neighbours.data[:] = 1.0
+    n_neighbours: Floats = np.asarray(neighbours.sum(axis=1))[:, None]
     for step_size in _STEP_SIZES:
-        mean = np.asarray(neighbors @ verts) / n_neighbors
+        mean = np.asarray(neighbours @ verts) / n_neighbours
         verts = np.clip(verts + step_size * (mean - verts), cells, cells + 1.0)
     return verts

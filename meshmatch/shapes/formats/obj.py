@@ -77,7 +77,7 @@ def vertices_of_corners(
 
 
 def join_lines(data: bytes) -> bytes:
-    r"""Normalize line ends to \n and join lines that are continued by a backslash.
+    r"""Normalise line ends to \n and join lines that are continued by a backslash.
 
     A comment is not continued, even if it ends in a backslash, as a path may. A line that begins with the keyword of an
     entry is not a continuation, so that a name that ends in a backslash does not swallow it.

@@ -1,6 +1,6 @@
 """Read the appearance of Wavefront OBJ files: texture coordinates, and materials from mtl files in the same folder.
 
-Images are not multiplied by Kd, since many programs write a gray Kd with every image; Kd is the color of faces without one.
+Images are not multiplied by Kd, since many programs write a grey Kd with every image; Kd is the color of faces without one.
 """
 
 from __future__ import annotations

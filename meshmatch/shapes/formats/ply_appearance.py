@@ -112,7 +112,7 @@ def _coordinates(name: str, content: Content, shape: Shape) -> tuple[Floats, Boo
 
 
 def _normalized(name: str) -> str:
-    """Normalize a property name: lower case, without "_" and "-"."""
+    """Normalise a property name: lower case, without "_" and "-"."""
     return name.lower().replace("_", "").replace("-", "")
 
 

@@ -71,7 +71,7 @@ def _without_header(text: bytes) -> tuple[bytes, list[bytes]]:
 
 
 def _normalize_separators(name: str, text: bytes) -> bytes:
-    """Normalize a table of numbers: cells separated by spaces, nan in empty cells, and decimal points.
+    """Normalise a table of numbers: cells separated by spaces, nan in empty cells, and decimal points.
 
     A comma within a word is a decimal comma if other separators split the lines into at least three words, no word has two
     commas and no number has a point. `InputError` if it may be a decimal comma or a separator.

@@ -121,7 +121,7 @@ def _sines(edges: Floats, before: Floats, normal: Floats) -> Floats:
     return np.asarray(np.divide(turn, size, out=np.zeros_like(turn), where=size > 0))
 
 
-def _neighbors(sizes: Ints) -> tuple[Ints, Ints]:
+def _neighbours(sizes: Ints) -> tuple[Ints, Ints]:
     """(N,) indices of the previous and the next corner of each corner, for polygons listed one after the other."""
     begins = np.cumsum(sizes) - sizes
     place = np.arange(int(sizes.sum()))
@@ -133,7 +133,7 @@ def _neighbors(sizes: Ints) -> tuple[Ints, Ints]:
 
 def _normals(places: Floats, sizes: Ints) -> Floats:
     """(P, 3) normal of each polygon by Newell's method, of length twice its area; computed relative to its first corner."""
-    after = _neighbors(sizes)[1]
+    after = _neighbours(sizes)[1]
     begins = np.cumsum(sizes) - sizes
     relative = places - np.repeat(places[begins], sizes, axis=0)
     return np.add.reduceat(cross_product(relative, relative[after]), begins, axis=0)
@@ -141,7 +141,7 @@ def _normals(places: Floats, sizes: Ints) -> Floats:
 
 def _has_reflex_corners(places: Floats, sizes: Ints) -> Bools:
     """(P,) whether a polygon has reflex corners, beyond rounding errors."""
-    before, after = _neighbors(sizes)
+    before, after = _neighbours(sizes)
     edges = places[after] - places
     sines = _sines(edges, edges[before], np.repeat(_normals(places, sizes), sizes, axis=0))
     begins = np.cumsum(sizes) - sizes
@@ -172,7 +172,7 @@ def _clip_ears(flat: Floats, sizes: Ints) -> tuple[Ints, Bools]:
     """Triangulate polygons by ear clipping, all in parallel.
 
     An ear is a convex corner whose triangle contains no other corner. Each polygon has a queue of corners to test: first
-    all, then the two neighbors of each ear that was cut, since the status of others does not change. If the queue runs
+    all, then the two neighbours of each ear that was cut, since the status of others does not change. If the queue runs
     empty too early, it is filled with all remaining corners, and corners on the edge of an ear are tolerated from then on;
     after the next time, ears of zero area as well; after the third, the polygon is given up.
 

@@ -79,7 +79,7 @@ def _rows(files: list[Made], valid: Found | None, opened: dict[str, Found], pict
 
 
 def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Summarize the rows by verb."""
+    """Summarise the rows by verb."""
     found = []
     for verb in dict.fromkeys(row["verb"] for row in rows):
         some = [row for row in rows if row["verb"] == verb]

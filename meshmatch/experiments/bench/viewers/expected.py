@@ -95,7 +95,7 @@ def differences(written: Written, found: dict[str, Any], tool: str) -> list[str]
     ]
     there, box = np.array(found["box"], float), written.box
     size = float(np.linalg.norm(np.ptp(box, axis=0)))
-    unit = 100.0 if tool == "three" and written.suffix == ".fbx" else 1.0  # three.js keeps the centimeters of fbx
+    unit = 100.0 if tool == "three" and written.suffix == ".fbx" else 1.0  # three.js keeps the centimetres of fbx
     scale = float(np.linalg.norm(np.ptp(there, axis=0))) / size
     if not np.isfinite(there).all():
         return [*wrong, "lies nowhere"]
