@@ -251,7 +251,7 @@ def test_what_is_no_map_is_refused(pair: tuple[Shape, Shape, VertexMap], wrong: 
     with pytest.raises(MeshmatchError):
         meshmatch.evaluate(wrong, source, target)
     with pytest.raises(InputError, match="truth"):
-        meshmatch.evaluate(found, source, target, np.zeros(642))
+        meshmatch.evaluate(found, source, target, np.full(642, 0.5))
 
 
 def test_maps_found_for_other_shapes_are_refused(pair: tuple[Shape, Shape, VertexMap], cube: Shape) -> None:
