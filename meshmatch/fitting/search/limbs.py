@@ -42,7 +42,7 @@ class LimbSettings:
     max_turned_joints : maximum number of consecutive joints that are turned, from the limb's end or the piece before it
     sweeps : how often each of these joints is turned
     max_miss : largest distance that may remain between the centroids of the limb and of the region
-    max_tried : maximum number of bent limbs that are refined
+    max_tried : maximum number of limbs that are bent from one start and refined
     min_labels : a limb with fewer labels is not considered tangled with others
     same_distance, different_share : two bends are the same if at most this share of the nodes is more than this distance
         apart
@@ -54,7 +54,7 @@ class LimbSettings:
     max_turned_joints: int = 3
     sweeps: int = 4
     max_miss: float = 0.08
-    max_tried: int = 4
+    max_tried: int = 2
     min_labels: int = 3
     same_distance: float = 0.05
     different_share: float = 0.02
@@ -165,18 +165,17 @@ class Limbs:
         return nodes - self._nodes, float(np.linalg.norm(end - target))
 
     def reaching(
-        self, samples: OrientedPoints, starts: Sequence[Float[Floats, "K 3"]], target: Float[Floats, " 3"]
+        self, samples: OrientedPoints, start: Float[Floats, "K 3"], target: Float[Floats, " 3"]
     ) -> list[Float[Floats, "K 3"]]:
-        """Node vectors with one limb bent to a point (core frame), for every limb that reaches it from any of the starts.
+        """Node vectors with one limb bent to a point (core frame), for every limb that reaches it from the start.
 
         Those with the least residuals come first, and at most `LimbSettings.max_tried` are returned.
         """
         found: list[Floats] = []
-        for start in starts:
-            for bend in self.bends:
-                bent, distance = self.bent(start, bend, target)
-                if distance <= SETTINGS.max_miss and all(_differ(bent, other) for other in found):
-                    found.append(bent)
+        for bend in self.bends:
+            bent, distance = self.bent(start, bend, target)
+            if distance <= SETTINGS.max_miss and all(_differ(bent, other) for other in found):
+                found.append(bent)
         found.sort(key=lambda each: two_way_residual(self._system, samples, each))
         return found[: SETTINGS.max_tried]
 

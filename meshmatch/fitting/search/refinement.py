@@ -201,9 +201,9 @@ def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidat
     """Return the fit with one limb bent to a region that it leaves uncovered, if that is better and leaves none.
 
     ``chosen`` is the candidate from which ``fit`` was refined. Limbs are bent in both: in the refined fit a limb that is in
-    the wrong place is deformed already, but the others are closer to theirs. The likeliest are refined. Fits with several
-    uncovered regions are left alone, as several limbs are wrong: on two people, each limb that was moved let another one go
-    astray. So are clouds, whose noise hides uncovered regions.
+    the wrong place is deformed already, but the others are closer to theirs. The likeliest of each are refined. Fits with
+    several uncovered regions are left alone, as several limbs are wrong: on two people, each limb that was moved let another
+    one go astray. So are clouds, whose noise hides uncovered regions.
     """
     task, limbs = comparison.task, limbs_of(comparison.task.model)
     if not limbs.bends or not task.samples.signed:
@@ -212,8 +212,8 @@ def with_limb_bent(comparison: WholeComparison, chosen: Candidate, fit: Candidat
     regions = uncovered_regions(local, task.system.surface(fit.vectors))
     if len(regions) != 1:
         return fit
-    starts = [comparison.average_similar(chosen).vectors, fit.vectors]
-    tried = limbs.reaching(local, starts, regions[0])
+    starts = comparison.average_similar(chosen).vectors, fit.vectors
+    tried = [bent for start in starts for bent in limbs.reaching(local, start, regions[0])]
     refined = parallel_map(lambda vectors: comparison.refined(replace(chosen, vectors=vectors), in_full=True), tried)
     complete = [each for each in refined if not uncovered_regions(local, task.system.surface(each.vectors))]
     bent = min(complete, key=lambda each: comparison.score(each, False), default=fit)
