@@ -158,6 +158,10 @@ def test_a_fit_with_a_limb_in_a_wrong_place_is_made_good(
     assert [np.array_equal(*each) for each in zip(starts, (still.vectors, fit.vectors), strict=True)] == [True, True]
     off = [np.linalg.norm(task.system.moved(each.vectors) - truth, axis=1) for each in both]
     assert off[0].max() > 0.25 and off[1].max() < 0.1
+    place = uncovered_regions(task.coarse, task.system.surface(fit.vectors))
+    with monkeypatch.context() as every_limb_leaves_a_region:
+        every_limb_leaves_a_region.setattr(refinement, "uncovered_regions", lambda *_: place)
+        assert with_limb_bent(comparison, still, fit) is fit
     monkeypatch.setattr(refinement, "SETTINGS", replace(refinement.SETTINGS, bent_margin=0.1))
     assert with_limb_bent(comparison, still, fit) is fit  # no fit is so much better
 
