@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "meshmatch"
 
 # From the ground up: a room imports itself and what stands before it. `experiments` measures what `api` composes.
-GROUND = ("errors", "threads", "batching", "derived", "blender", "outputs", "locks", "progress")
+GROUND = ("errors", "scalars", "threads", "batching", "derived", "blender", "outputs", "locks", "progress")
 ROOMS = (
     *GROUND,
     *("arrays", "geometry", "shapes", "templates", "generators", "fields", "models", "training", "fitting"),

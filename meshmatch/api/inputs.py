@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ from meshmatch.arrays import Int, Ints, to_numpy
 from meshmatch.errors import InputError, ModelError, OptionError
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import landmark_places
+from meshmatch.scalars import is_integer
 from meshmatch.shapes.alignment import in_single_precision
 from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.repair import Repaired, repair
@@ -95,15 +95,9 @@ def checked_threads(threads: int | None) -> int:
     """Return the number of threads, `THREADS` for None; `OptionError` if it is below 1 or not an integer."""
     if threads is None:
         return THREADS
-    if not isinstance(threads, Integral) or threads < 1:
+    if not is_integer(threads, 1):
         raise OptionError(f"threads must be 1 or more, not {threads!r}", "leave it out for the default")
     return int(threads)
-
-
-def check_seed(seed: object) -> None:
-    """Raise `OptionError` unless a seed is a non-negative integer."""
-    if not isinstance(seed, Integral) or seed < 0:
-        raise OptionError(f"a seed is a whole number of 0 or more, not {seed!r}")
 
 
 def check_config(config: object) -> None:

@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -31,6 +30,7 @@ from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.models.trained import TrainedModel
 from meshmatch.outputs import folder_on_success
 from meshmatch.progress import ProgressCallback
+from meshmatch.scalars import is_integer, is_number
 from meshmatch.shapes.deformed_files import MovedFile
 from meshmatch.shapes.files import ShapeLike, as_shapes
 from meshmatch.shapes.shape import Shape
@@ -92,7 +92,7 @@ class InterpolationOptions:
 
     def __post_init__(self) -> None:
         for name in ("start", "stop"):
-            if not isinstance(value := getattr(self, name), Real):
+            if not is_number(value := getattr(self, name)):
                 raise OptionError(f"{name} must be a number, not {value!r}", "the source is at 0 and the target at 1")
         if not EARLIEST <= self.start < self.stop <= LATEST:
             times = f"times go from {EARLIEST:g} to {LATEST:g}, the earlier first"
@@ -219,7 +219,7 @@ def interpolate(
     matcher = matcher_for(model, None, threads, progress)
     loaded = as_shapes(shapes) if isinstance(matcher, Matcher) else []
     for count, what in ((len(shapes), "two shapes to go between"), (frames, "two shapes to make")):
-        if not isinstance(count, Integral):
+        if not is_integer(count):
             raise OptionError(f"the number of shapes to make must be an integer, not {count!r}", "give 2 or more")
         if count < 2:
             raise OptionError(f"a sequence needs at least {what}, not {count}", "give two or more")

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from meshmatch.api.inputs import check_seed
 from meshmatch.api.kinds import UnitName, error_unit
 from meshmatch.arrays import Float, Floats, ShortRepr, to_numpy
 from meshmatch.errors import InputError, OptionError
@@ -27,6 +25,7 @@ from meshmatch.maps.vertex_map import VertexMap, check_map
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.progress import ProgressCallback
+from meshmatch.scalars import check_seed, is_number
 from meshmatch.shapes.deformed_files import save_moved
 from meshmatch.shapes.files import ShapeLike, as_shape
 from meshmatch.shapes.formats.gltf_rig import Binding
@@ -316,7 +315,7 @@ class ConfidenceRule:
     def __post_init__(self) -> None:
         if self.fill and self.blank is not None:
             raise OptionError("fill and blank contradict each other", "choose one of them")
-        if not (isinstance(self.minimum, Real) and 0 <= self.minimum <= 1):
+        if not (is_number(self.minimum) and 0 <= self.minimum <= 1):
             raise OptionError(f"a confidence lies in 0..1, not {self.minimum!r}")
 
 

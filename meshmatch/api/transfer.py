@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, get_args
 
@@ -21,6 +20,7 @@ from meshmatch.arrays import Floats, as_numbers, to_numpy
 from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.scalars import is_integer
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import linear_to_srgb_alpha, srgb_to_linear_alpha
 from meshmatch.shapes.dressed_files import warn_about_losses
@@ -387,7 +387,7 @@ def transfer_weights(
     source = as_shape(source, "source")
     if rule.blank is not None:
         raise OptionError("skin weights cannot be left blank", "fill them in, or keep them")
-    if not isinstance(influences, Integral) or influences < 1:
+    if not is_integer(influences, 1):
         raise OptionError(
             f"influences must be an integer of 1 or more, not {influences!r}", "4 is what most programs read"
         )

@@ -20,6 +20,7 @@ from meshmatch.collections.modes import compute_modes, outward_signs
 from meshmatch.collections.superimpose import Poses, Scale, Shapes, Superimposed, iter_blocks, superimpose
 from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting.fit import Fit, facing_out
+from meshmatch.scalars import check_seed, is_integer
 from meshmatch.shapes.shape import Shape
 
 
@@ -150,8 +151,8 @@ class Atlas(ShortRepr, PickledFields):
         """
         if scale not in get_args(Scale):
             raise OptionError(f"invalid scale {scale!r}", f"choose one of {', '.join(get_args(Scale))}")
-        if modes < 1:
-            raise OptionError(f"an atlas has one mode or more, not {modes}")
+        if not is_integer(modes, 1):
+            raise OptionError(f"an atlas has one mode or more, not {modes!r}")
         if not hasattr(points, "shape"):
             points = [np.asarray(getattr(each, "verts", each)) for each in points]
         shape_names = tuple(names) if names is not None else tuple(f"shape-{k:03d}" for k in range(len(points)))
@@ -252,8 +253,9 @@ class Atlas(ShortRepr, PickledFields):
         list of Shape
             In the unit of the shapes.
         """
-        if count < 0:
-            raise OptionError(f"cannot make {count} shapes")
+        if not is_integer(count, 0):
+            raise OptionError(f"cannot make {count!r} shapes")
+        check_seed(seed)
         draws = np.random.default_rng(seed).standard_normal((count, len(self.modes)))
         offsets = (self.offsets(row[None])[0] for row in draws)
         return [Shape(self.mean + each, self.faces, f"sample-{k:03d}") for k, each in enumerate(offsets)]

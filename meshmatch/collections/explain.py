@@ -14,6 +14,7 @@ from meshmatch.collections.covariates import SIZE, Covariates, DesignTerm, compl
 from meshmatch.collections.formula import Factor, parse
 from meshmatch.collections.groups import STATISTICS, Statistic
 from meshmatch.errors import OptionError
+from meshmatch.scalars import check_seed, is_integer
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +91,9 @@ def explain(
     """
     if kind not in STATISTICS:
         raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
-    if permutations < 1:
+    if not is_integer(permutations, 1):
         raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
+    check_seed(seed)
     model = parse(formula)
     if (model.space == "shape") != (scale == "remove"):
         kept = "keeps the shapes' sizes" if scale == "keep" else "has shapes of one size"

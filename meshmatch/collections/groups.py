@@ -15,6 +15,7 @@ import numpy as np
 from meshmatch.arrays import Bool, Bools, Float, Floats, ShortRepr, set_read_only
 from meshmatch.collections.permutation import TIE_TOLERANCE, run_tests, whitened
 from meshmatch.errors import OptionError
+from meshmatch.scalars import check_seed, is_integer
 
 Statistic = Literal["normal", "hotelling"]
 STATISTICS: tuple[Statistic, ...] = ("normal", "hotelling")
@@ -74,8 +75,9 @@ def compare_groups(
     """
     if kind not in STATISTICS:
         raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
-    if permutations < 1:
+    if not is_integer(permutations, 1):
         raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
+    check_seed(seed)
     S = len(offsets)
     second = int(in_second.sum())
     if min(second, S - second) < 2:

@@ -21,6 +21,7 @@ from contextlib import closing, contextmanager, nullcontext, suppress
 from typing import Any, Protocol, TypeVar
 
 from meshmatch.errors import InputError, MeshmatchError, OptionError, needs, warn
+from meshmatch.scalars import is_integer
 from meshmatch.threads import set_threads
 
 Item = TypeVar("Item")
@@ -256,8 +257,8 @@ class Cluster:
 @contextmanager
 def open_workers(spec: int | str | None = None) -> Iterator[Workers]:
     """Open a number of processes on this machine, by default one per core, or the Dask cluster at an address."""
-    if isinstance(spec, int) and spec < 1:
-        raise OptionError(f"workers must be 1 or more, not {spec}", "leave it out for one per core")
+    if spec is not None and not isinstance(spec, str) and not is_integer(spec, 1):
+        raise OptionError(f"workers must be 1 or more, not {spec!r}", "leave it out for one per core")
     workers: Workers = Cluster(spec) if isinstance(spec, str) else Processes(spec or _cores())
     try:
         yield workers

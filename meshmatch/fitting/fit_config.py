@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import inf
-from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from meshmatch.errors import OptionError
 from meshmatch.models.card import MIRRORINGS
+from meshmatch.scalars import is_integer, is_number
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -143,7 +143,7 @@ class LatentRefineConfig:
             _check_count(name, getattr(self, name), 1)
         for name in ("rate", "chamfer", "volume", "arap"):
             value = getattr(self, name)
-            if not _is_number(value) or not (0 < value < inf or (value == 0 and name != "rate")):
+            if not is_number(value) or not (0 < value < inf or (value == 0 and name != "rate")):
                 least = "above 0" if name == "rate" else "of 0 or more"
                 raise OptionError(f"{name} cannot be {value!r}", f"give a number {least}, or leave it out")
 
@@ -243,7 +243,7 @@ class FitConfig:
             raise OptionError(f"mirror cannot be {self.mirror!r}", f"choose one of {', '.join(MIRRORINGS)}")
         for name, least in _MINIMUMS.items():
             _check_count(name, getattr(self, name), least)
-        if not _is_number(self.tilt) or not 0 <= self.tilt <= 180:
+        if not is_number(self.tilt) or not 0 <= self.tilt <= 180:
             raise OptionError(f"tilt cannot be {self.tilt!r}", "give degrees from 0 to 180, or leave it out")
         kinds = {"device": str, "nodes": NodeRefineConfig, "latent": LatentRefineConfig}
         for name, kind in kinds.items():
@@ -331,14 +331,9 @@ class FitConfig:
 
 
 def _check_count(name: str, value: object, least: int) -> None:
-    """Raise `OptionError` unless a value is an integer of at least ``least``; a bool is none."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+    """Raise `OptionError` unless a value is an integer of at least ``least``."""
+    if not is_integer(value, least):
         raise OptionError(f"{name} cannot be {value!r}", f"give an integer of {least} or more, or leave it out")
-
-
-def _is_number(value: object) -> bool:
-    """Whether a value is a real number; a bool is none."""
-    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def axis_of(name: str) -> tuple[int, float]:

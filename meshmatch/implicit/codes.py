@@ -24,6 +24,7 @@ from meshmatch.implicit.objective import PUBLISHED, ImplicitLoss
 from meshmatch.implicit.samples import load_source, sample_shape
 from meshmatch.models.card import ImplicitCard
 from meshmatch.progress import ProgressCallback
+from meshmatch.scalars import check_seed, is_integer
 from meshmatch.shapes.files import ShapeLike, as_shape
 
 # samples of the shape, in one step, and to choose the initial code
@@ -71,8 +72,9 @@ def fit_implicit(
     >>> chair = meshmatch.fit_implicit(model, "chair.ply")
     >>> chair.verdict, chair.reasons
     """
-    if steps < 1:
-        raise OptionError(f"a latent code cannot be found in {steps} steps", "200 are usual")
+    if not is_integer(steps, 1):
+        raise OptionError(f"a latent code cannot be found in {steps!r} steps", "200 are usual")
+    check_seed(seed)
     start = time.monotonic()
     source = load_source(shape) if isinstance(shape, str | Path) else as_shape(shape)
     name = source.name or "shape"

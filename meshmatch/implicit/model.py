@@ -26,6 +26,7 @@ from meshmatch.models.card import ImplicitCard, read_implicit_card
 from meshmatch.models.checkpoint import load_weights
 from meshmatch.models.registry import WEIGHTS, check_weights, locate_model
 from meshmatch.models.tensor_file import read_header
+from meshmatch.scalars import is_integer
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -352,8 +353,8 @@ def nearest_on_template(
 
 def check_resolution(resolution: int) -> None:
     """Raise `OptionError` unless ``resolution`` is valid for marching cubes."""
-    if not 8 <= resolution <= 512 or resolution % 2:
-        raise OptionError(f"resolution must be even, from 8 to 512, not {resolution}")
+    if not is_integer(resolution, 8) or resolution > 512 or resolution % 2:
+        raise OptionError(f"resolution must be even, from 8 to 512, not {resolution!r}")
 
 
 def percent_of_side(distance: float) -> float:

@@ -17,6 +17,7 @@ from meshmatch.arrays import Float, Floats, PickledFields, ShortRepr, as_numbers
 from meshmatch.errors import InputError
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.scalars import is_integer
 from meshmatch.shapes.files import ShapeLike, as_shape
 
 _INFO_HINT = "meshmatch info FILE says what is in it"
@@ -79,7 +80,7 @@ def laplacian_basis(shape: ShapeLike, K: int = 100) -> LaplacianBasis:
     """
     found = as_shape(shape)
     name = found.name or "the shape"
-    if not isinstance(K, int | np.integer) or isinstance(K, bool):
+    if not is_integer(K):
         raise InputError(f"the number of eigenfunctions must be an integer, not {K!r}", f"ask for 1 to {found.V - 2}")
     if not 1 <= K <= found.V - 2:
         raise InputError(f"{name} with {found.V} vertices has no {K} eigenfunctions", f"ask for 1 to {found.V - 2}")

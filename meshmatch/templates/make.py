@@ -23,6 +23,7 @@ from meshmatch.derived import derived
 from meshmatch.errors import OptionError, TemplateError
 from meshmatch.geometry.kernels import poorly_supported
 from meshmatch.geometry.trees import cKDTree
+from meshmatch.scalars import check_seed, is_integer
 from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.decimate import Quality, decimate
 from meshmatch.shapes.sampling import Samples, farthest_points, sample_surface, triangulate_cloud
@@ -64,14 +65,15 @@ class NodeConfig:
     def __post_init__(self) -> None:
         if self.strategy not in STRATEGIES:
             raise OptionError(f"unknown node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
-        if self.K < 4:
-            raise OptionError(f"{self.K} nodes are too few", "moving least squares needs at least 4")
+        if not is_integer(self.K, 4):
+            raise OptionError(f"{self.K!r} nodes are too few", "moving least squares needs at least 4")
         if not 0 < self.radius < np.inf:
             raise OptionError(f"a node radius must be positive, not {self.radius:g}", "0.13 suits a body")
         if not 0 <= self.depth < np.inf:
             raise OptionError(f"a depth of candidates must be 0 or more, not {self.depth:g}")
-        if self.clusters < 1:
-            raise OptionError(f"at least one cluster is needed, not {self.clusters}")
+        if not is_integer(self.clusters, 1):
+            raise OptionError(f"at least one cluster is needed, not {self.clusters!r}")
+        check_seed(self.seed)
 
 
 def low_mesh(

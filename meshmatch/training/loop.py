@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
-from numbers import Integral
 from pathlib import Path
 from typing import Any, get_args
 
@@ -28,6 +27,7 @@ from meshmatch.models.deformer import Deformer
 from meshmatch.models.inference import training_device
 from meshmatch.outputs import replace_on_success
 from meshmatch.progress import Progress
+from meshmatch.scalars import check_seed, is_integer, is_number
 from meshmatch.training.batches import Draw, batches
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
@@ -76,15 +76,15 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("steps", "shapes", "scans_per_shape", "threads"):
             value = getattr(self, name)
-            if not isinstance(value, Integral) or value < 1:
+            if not is_integer(value, 1):
                 raise OptionError(f"{name} must be 1 or more, a whole number, not {value!r}")
+        check_seed(self.seed)
         if self.draw not in get_args(Draw):
             raise OptionError(f"batches are drawn on {', '.join(get_args(Draw))}, not {self.draw!r}")
-        numbers = isinstance(self.rate, int | float) and isinstance(self.decay, int | float)
-        whole = isinstance(self.workers, Integral)
-        if not (numbers and whole and self.rate > 0 and 0 <= self.decay <= 1 and self.workers >= 0):
+        numbers = is_number(self.rate) and is_number(self.decay) and is_integer(self.workers, 0)
+        if not (numbers and self.rate > 0 and 0 <= self.decay <= 1):
             raise OptionError("a training needs a positive rate, a decay in 0..1 and workers of 0 or more")
-        if self.minutes is not None and not (isinstance(self.minutes, int | float) and self.minutes > 0):
+        if self.minutes is not None and not (is_number(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes must be positive, not {self.minutes!r}")
         if not isinstance(self.loss, Objective):
             raise OptionError(f"a loss is an Objective, not {self.loss!r}", "see docs/training.md for custom losses")

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
-from numbers import Integral
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from meshmatch.arrays import Bools, Floats, Floats32, Ints, Ints32, UInts8
 from meshmatch.errors import OptionError
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.scalars import is_integer
 from meshmatch.shapes.appearance import Alpha, Appearance, BakedMaterial, Finish, Layer, Pixels
 from meshmatch.shapes.colors import linear_to_bytes
 from meshmatch.shapes.shape import Shape
@@ -94,7 +94,7 @@ class BakeOptions:
             ("workers", 1, 4096, "one for each core is enough"),
         ):
             value = getattr(self, name)
-            if not isinstance(value, Integral) or not low <= int(value) <= high:
+            if not is_integer(value, low) or value > high:
                 raise OptionError(f"{name} must be an integer from {low} to {high}, not {value!r}", hint)
         if self.padding > self.size // 4:
             problem = f"padding of {self.padding} texels is not possible with {self.size}"

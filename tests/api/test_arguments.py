@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 import meshmatch
-from meshmatch import MeshmatchError, VertexMap
+from meshmatch import Atlas, MeshmatchError, VertexMap
+from meshmatch.api.inputs import checked_threads
+from meshmatch.collections.workers import open_workers
+from meshmatch.implicit.codes import fit_implicit
+from meshmatch.implicit.model import check_resolution
 from meshmatch.maps.places import Places
+from meshmatch.scalars import check_seed
+from meshmatch.templates.make import NodeConfig
 from meshmatch.templates.prepared_folder import read_registered
+from meshmatch.training.loop import TrainConfig
 from meshmatch.training.recipes import Recipe, default
 from tests.conftest import icosphere
 from tests.models.small_model import small_template
@@ -60,3 +67,30 @@ def test_shapes_to_learn_are_named(recipe: Recipe | None, tmp_path: Path) -> Non
 def test_shapes_to_measure_on_are_named() -> None:
     with pytest.raises(MeshmatchError, match="expected a path"):
         read_registered(3, small_template())  # type: ignore[arg-type]
+
+
+BALLS = [BALL.verts * [1, 1, axis] for axis in (1.0, 1.2, 1.3, 1.5, 1.6)]
+ROW = Atlas.of(BALLS, BALL.faces)
+PAIRS: Any = (ROW.names[:2], ROW.names[2:])
+
+
+@pytest.mark.parametrize("call", [
+    lambda: checked_threads(True), lambda: check_seed(True), lambda: ROW.sample(True), lambda: ROW.sample(2, True),
+    lambda: Atlas.of(BALLS, BALL.faces, modes=True), lambda: ROW.compare(*PAIRS, permutations=True),
+    lambda: ROW.compare(*PAIRS, seed=True), lambda: meshmatch.interpolate([BALL, BALL], True),
+    lambda: meshmatch.InterpolationOptions(stop=True), lambda: meshmatch.ConfidenceRule(True),
+    lambda: meshmatch.transfer_weights(BALL, BALL, np.ones((BALL.V, 1)), influences=True),
+    lambda: meshmatch.BakeOptions(samples=True), lambda: TrainConfig(steps=True), lambda: TrainConfig(workers=True),
+    lambda: TrainConfig(rate=True), lambda: TrainConfig(seed=True), lambda: NodeConfig(clusters=True),
+    lambda: NodeConfig(seed=True), lambda: meshmatch.laplacian_basis(BALL, True), lambda: check_resolution(True),
+    lambda: open_workers(True).__enter__(), lambda: fit_implicit(BALL, BALL, steps=True),
+])  # fmt: skip
+def test_a_bool_is_no_number(call: Callable[[], Any]) -> None:
+    with pytest.raises(MeshmatchError, match=r"True|at least one perm|positive rate"):
+        call()
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    assert checked_threads(np.int64(3)) == 3
+    assert len(ROW.sample(np.int32(2), np.uint8(1))) == 2
+    assert meshmatch.BakeOptions(size=np.int16(64)).size == 64
