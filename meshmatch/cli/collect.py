@@ -68,6 +68,7 @@ def fit(
     """
     from meshmatch.collections.fit_all import elsewhere_messages
     from meshmatch.collections.setting import FAILED, LEFT_OUT
+    from meshmatch.collections.sources import WARNED
 
     how.check()
     if how.model != NO_MODEL:
@@ -89,7 +90,8 @@ def fit(
         chosen = f" (model {model})" if how.model == AUTO else ""
         found = _summarize_verdicts(replace(made, records=tuple(records)).counts)
         console.say(f"wrote {written} fit{'s' * (written != 1)} to {where}{chosen}: {found}")
-    if others := [record.name for record in made.records if record.verdict == LEFT_OUT]:
+    ignored = [each for each in made.records if each.verdict == LEFT_OUT]
+    if others := [each.name for each in ignored if not each.reasons.startswith(WARNED)]:
         console.say(f"ignored, as they are not shapes: {_summarize_files(others)}; see {output}/fits.csv")
     console.say(*elsewhere_messages(made.elsewhere))
     if counts["poor"] and not how.try_harder:

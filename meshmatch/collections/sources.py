@@ -31,6 +31,8 @@ _UNREADABLE_SHAPES = {
     *(".skp", ".sldprt", ".spz", ".step", ".stp", ".vrml", ".wrl", ".wrz", ".x3d", ".ztl", ".zpr"),
 }  # suffixes of formats of shapes that `load_shape` does not read
 _UNREADABLE, _UNKNOWN = "shapes in formats that are not read", "files of unknown format"
+WARNED = "left out: "
+"""Begins the reasons of files that a warning named."""
 _TEXT_FILES = {"readme", "license", "licence", "copying", "changelog", "makefile", "authors", "notice"}
 _MAX_NAMES = 5  # files listed in a warning
 _WILDCARDS = "*?["
@@ -165,7 +167,7 @@ def _records_with_warning(
             more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
             warn(f"{given}: {why} are left out: {plain_text(', '.join(names[:_MAX_NAMES]) + more)}")
             verdict = FAILED if why in failed else LEFT_OUT
-            found += [Record(name, f"{folder}{name}", verdict, reasons=f"left out: {why}") for name in names]
+            found += [Record(name, f"{folder}{name}", verdict, reasons=f"{WARNED}{why}") for name in names]
     for file in skipped:
         if file not in warned:
             why = "an array next to shapes" if suffix_of(file) == ".npy" else "not a format of shapes"
