@@ -85,7 +85,7 @@ class Fitted:
     """
 
     records: tuple[Record, ...]
-    agreed: int  # number of fits that took part in the agreement
+    agreed: int  # number of fits that took part in an agreement, elsewhere too
     model: str
     elsewhere: Mapping[str, str] = field(default_factory=dict)
 
@@ -209,7 +209,7 @@ def _fit_other_kinds(
     for number, record in enumerate(result.records):
         if record.kind:
             numbers_by_kind[record.kind].append(number)
-    records, elsewhere = list(result.records), {}
+    records, agreed, elsewhere = list(result.records), result.agreed, {}
     for kind, numbers in numbers_by_kind.items():
         store, own = Store.of(f"{requested.store.location}/{kind}"), [sources[number] for number in numbers]
         try:
@@ -221,6 +221,7 @@ def _fit_other_kinds(
                 for number in numbers:
                     tell(records[number])
             continue
+        agreed += found.agreed
         for number, record in zip(numbers, found.records, strict=True):
             where = f"{kind}: its fit is in {store.location}"
             records[number] = replace(record, kind=kind, notes=f"{where}; {record.notes}".removesuffix("; "))
@@ -228,7 +229,7 @@ def _fit_other_kinds(
                 elsewhere[record.name] = store.location
     if numbers_by_kind:
         _write_table(requested.store, records)
-    return replace(result, records=tuple(records), elsewhere=elsewhere)
+    return replace(result, records=tuple(records), agreed=agreed, elsewhere=elsewhere)
 
 
 def _skip_other_kinds(tell: Callable[[Record], None] | None) -> Callable[[Record], None] | None:

@@ -598,6 +598,7 @@ def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path)
     assert collection.names == ["a-dancer"]
     assert made.elsewhere == dict.fromkeys(("calf", "fox"), str(tmp_path / "fits" / "quadruped"))
     assert (made.model, [record.verdict for record in made.records]) == ("human", ["good"] * 3)
+    assert made.agreed == 2  # the two animals
     assert [record.kind for record in made.records] == ["", "quadruped", "quadruped"]
     assert made.records[1].notes.startswith(f"quadruped: its fit is in {tmp_path / 'fits' / 'quadruped'}")
     animals = meshmatch.Collection(tmp_path / "fits" / "quadruped")
