@@ -21,8 +21,15 @@ _MAX_VALUES |= dict.fromkeys(
     ("holes", "outliers", "partial", "outside", "strays", "characters", "stylised", "average"), 1
 )
 _MAX_VALUES |= {"momentum": 0.9999999}
-_MIN_VALUES = {"points": 64}
+_MIN_VALUES = {"points": 64, "steps": 1, "shapes": 1, "scans_per_shape": 1, "threads": 1}
 T = TypeVar("T")
+
+
+def check_range(name: str, value: float, label: str = "") -> None:
+    """Raise `OptionError` unless a setting lies in its range; ``label`` is its name in the message."""
+    low, high = _MIN_VALUES.get(name, 0), _MAX_VALUES.get(name, 2**53)
+    if not low <= value <= high:
+        raise OptionError(f"{label or name} must lie in {low}..{high:,}, not {value}")
 
 
 def with_changes(values: T, changes: Mapping[str, Any], where: str = "") -> T:
@@ -45,8 +52,7 @@ def with_changes(values: T, changes: Mapping[str, Any], where: str = "") -> T:
         }.get(kind, isinstance(value, str))
         if not is_valid:
             raise OptionError(f"{label} must be {kind}, not {str(value)[:40]!r}")
-        low, high = _MIN_VALUES.get(name, 0), _MAX_VALUES.get(name, 2**53)
-        if type(value) is not bool and is_number and not low <= value <= high:
-            raise OptionError(f"{label} must lie in {low}..{high:,}, not {value}")
+        if is_number:
+            check_range(name, value, label)
     changed: Any = replace(values, **changes)  # type: ignore[type-var]
     return changed  # type: ignore[no-any-return]

@@ -29,6 +29,7 @@ from meshmatch.outputs import replace_on_success
 from meshmatch.progress import Progress
 from meshmatch.scalars import check_seed, is_integer, is_number
 from meshmatch.training.batches import Draw, batches
+from meshmatch.training.limits import check_range
 from meshmatch.training.losses import CorrespondenceLoss, Objective
 
 OF_THE_MACHINE = ("minutes", "checkpoint_minutes", "threads", "device", "draw", "compile")
@@ -74,16 +75,15 @@ class TrainConfig:
     loss: Objective = field(default_factory=CorrespondenceLoss)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "shapes", "scans_per_shape", "threads"):
-            value = getattr(self, name)
-            if not is_integer(value, 1):
-                raise OptionError(f"{name} must be 1 or more, a whole number, not {value!r}")
+        for name in ("steps", "shapes", "scans_per_shape", "workers", "threads"):
+            if not is_integer(value := getattr(self, name)):
+                raise OptionError(f"{name} must be a whole number, not {value!r}")
+            check_range(name, value)
         check_seed(self.seed)
         if self.draw not in get_args(Draw):
             raise OptionError(f"batches are drawn on {', '.join(get_args(Draw))}, not {self.draw!r}")
-        numbers = is_number(self.rate) and is_number(self.decay) and is_integer(self.workers, 0)
-        if not (numbers and self.rate > 0 and 0 <= self.decay <= 1):
-            raise OptionError("a training needs a positive rate, a decay in 0..1 and workers of 0 or more")
+        if not (is_number(self.rate) and is_number(self.decay) and self.rate > 0 and 0 <= self.decay <= 1):
+            raise OptionError("a training needs a positive rate and a decay in 0..1")
         if self.minutes is not None and not (is_number(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes must be positive, not {self.minutes!r}")
         if not isinstance(self.loss, Objective):

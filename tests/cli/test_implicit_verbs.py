@@ -65,6 +65,8 @@ def test_a_folder_becomes_a_model_and_goes_on(folder: Path, tmp_path: Path, caps
         (["--preset", "paper", "--arap", "0.001"], "--arap does not go with --implicit --preset paper"),
         (["--bf16"], "--bf16 does not go"),
         (["--compile"], "--compile does not go"),
+        (["--steps", str(10**20)], "steps must lie in 1.."),
+        (["--workers", "100000"], "workers must lie in 0..256"),
         *(
             (["--field", "pointwise", energy, "0.001"], f"{energy} does not go with --implicit --field pointwise")
             for energy in ("--volume", "--arap", "--blend")

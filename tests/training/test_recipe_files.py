@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from meshmatch.errors import InputError, MeshmatchWarning, OptionError
+from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError
 from meshmatch.models.inference import training_device
 from meshmatch.templates.location import bundled_folder
 from meshmatch.training.loop import TrainConfig
@@ -111,7 +111,7 @@ def test_a_loss_of_ones_own_is_named_and_never_loaded(tmp_path: Path) -> None:
     ([], "not an object"), ({"recipe": 3}, "recipe must be an object"),
     ({"recipe": {"train": {"stps": 1}}}, "train.stps"),
     ({"recipe": {"train": {"steps": "9"}}}, "steps must be int"), ({"recipe": {"train": {"steps": True}}}, "must be int"),
-    ({"recipe": {"train": {"steps": 0}}}, "steps must be 1 or more"),
+    ({"recipe": {"train": {"steps": 0}}}, "steps must lie in 1.."),
     ({"recipe": {"scan": {"points": 10**9}}}, "64..100,000"),
     ({"recipe": {"train": {"rate": float("nan")}}}, "rate must be float"), ({"recipe": {"scan": {"noise": -1}}}, "0..9"),
     ({"recipe": {"loss": ["x"]}}, "a custom loss"), ({"recipe": {"storage": "int2"}}, "storage"),
@@ -176,3 +176,15 @@ def test_a_device_that_is_not_there_is_refused_before_the_work() -> None:
     with pytest.raises(OptionError, match="no device 'tpu'") as caught:
         training_device(wanted="tpu")
     assert "cpu" in caught.value.hint
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2**53 + 1])
+def test_steps_have_one_range_wherever_they_come_from(steps: int, tmp_path: Path) -> None:
+    file = written(tmp_path, {"recipe": {"train": {"steps": steps}}})
+    for take in (
+        lambda: read_recipe(file, people()),
+        lambda: people().changed(steps=steps),
+        lambda: TrainConfig(steps=steps),
+    ):
+        with pytest.raises(MeshmatchError, match=r"steps must lie in 1\.\.9,007,199,254,740,992, not"):
+            take()
