@@ -178,8 +178,9 @@ class VertexMap(PickledFields):
             The other attributes: face, barycentric, confidence, verdict, reasons.
 
             For points within triangles, given by faces and weights, the index is usually the corner with the largest
-            weight: ``target.faces[face, weights.argmax(1)]``. Errors of `evaluate` are measured at ``index``; `points`,
-            `apply` and `functional` use faces and weights.
+            weight: ``target.faces[face, weights.argmax(1)]``. It may be another vertex, such as the nearest one, which
+            need not be a corner. Errors of `evaluate` are measured at ``index``; `points`, `apply` and `functional` use
+            faces and weights.
 
         Returns
         -------
