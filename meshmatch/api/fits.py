@@ -75,7 +75,7 @@ def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -
     Raises
     ------
     InputError
-        The file is missing or damaged, or its fit is of another template.
+        The file is missing, damaged or unfinished, or its fit is of another template.
     ModelError
         The model is not installed.
 
@@ -96,6 +96,9 @@ def load_fit(path: str | Path, model: str | Path | TrainedModel | None = None) -
             )
     read = read_fit(path, as_model(model).template)
     if read.shape is None:
+        if not isinstance(read.fit, PlacedFit):
+            hint = "give a file of save_fit or of a collection's folder `fits`, or fit the shape again"
+            raise InputError(f"{path.name} contains neither the shape of its fit nor the places of its vertices", hint)
         return read.fit
     clean = replace(repair_allowing_parts(read.shape), left_out=read.fit.left_out)
     return replace(read.fit, verts=clean.shape.verts, repaired=clean)

@@ -162,6 +162,10 @@ def test_files_of_fits_are_refused_in_words(folder: Path, result: MatchResult, t
         with pytest.raises(InputError, match=r"a\.safetensors is damaged") as caught:
             load_fit(path, folder)
         assert "fit the shape again" in caught.value.hint
+    del arrays["shape_verts"]
+    save_file(arrays, path, header)
+    with pytest.raises(InputError, match="contains neither the shape of its fit nor"):
+        load_fit(path, folder)
 
 
 def test_what_a_shape_derives_stays_behind(cube: Shape) -> None:
