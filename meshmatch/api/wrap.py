@@ -103,7 +103,7 @@ def wrap(
         A mesh or point cloud of the same kind of shape.
     free
         (N,) vertices of the base that keep their local shape and follow those around them, such as eyes and the inside of
-        a mouth.
+        a mouth. Vertices of weight 0 do so too.
     model
         As in `match`; implicit models are not supported.
     config
@@ -135,6 +135,8 @@ def wrap(
     if mesh.is_cloud:
         raise OptionError(f"{mesh.name or 'the base'} has no faces, and only a mesh can be wrapped", "give a mesh")
     kept = _vertex_mask(mesh, free)
+    if mesh.weights is not None:
+        kept |= mesh.weights == 0
     found = matching.match(
         mesh, surface, model=model, config=config, landmarks=landmarks, threads=threads, progress=progress
     )  # fmt: skip

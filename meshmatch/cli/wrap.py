@@ -32,7 +32,8 @@ def wrap(
     free: Path | None = optional(
         "FILE",
         "Vertices of BASE that keep their local shape and follow those around them, such as eyes and the inside of the "
-        'mouth: a number per line, counted from 0 (.txt, .csv or .npy), or lists by part, {"eyes": [17, 18]} (.json).',
+        'mouth: a number per line, counted from 0 (.txt, .csv or .npy), or lists by part, {"eyes": [17, 18]} (.json). '
+        "Meshes that --only and --without leave out do so too.",
     ),
     picture: Picture = None,
 ) -> None:
@@ -76,7 +77,7 @@ def wrap(
     apart = result.distance[~result.free & a.valid]
     numbers = {"mean": apart.mean(), "95 %": np.quantile(apart, 0.95), "worst": apart.max()} if len(apart) else {}
     distances = ", ".join(f"{what} {value:.4g}" for what, value in numbers.items())
-    kept = f"; {len(np.unique(rows))} vertices kept their shape" if len(rows) else ""
+    kept = f"; {result.free.sum()} vertices kept their shape" if result.free.any() else ""
     console.say(f"vertices to {names[1]} (whose sqrt(area) is {np.sqrt(b.area):.4g}): {distances}{kept}")
     # Free parts, such as eyes, are not meant to lie on the scan.
     surfaces = surfaces_apart(result.match, result.shape, b, "file", one_way=bool(result.free.any()))

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.distance import pdist
 
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
@@ -56,6 +58,17 @@ def test_free_vertices_by_number_or_part(run: Run, files: Path, name: str, text:
     answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--free", name, "--json"))
     assert json.loads(answer.out)["free"] == 2
     assert "2 vertices kept their shape" in answer.err
+
+
+def test_what_is_left_out_keeps_its_shape(run: Run, files: Path) -> None:
+    """A blade beside the rod, a part of the file, is no part of the scan: it is carried along."""
+    body, blade = rod(), trimesh.creation.box((0.02, 0.4, 0.02)).subdivide()
+    verts = np.concatenate([body.verts, np.add(blade.vertices, [0.3, 0.0, 0.0])])
+    save_shape("base.ply", Shape(verts, np.concatenate([body.faces, blade.faces + body.V])))
+    answer = well(run("wrap", "base.ply", "scan.ply", "-o", "out.ply", "--without", "2", "--json"))
+    assert json.loads(answer.out)["free"] == len(blade.vertices)
+    before, after = (pdist(each[body.V :]) for each in (verts, load_shape("out.ply").verts))
+    assert np.ptp(after / before) < 1e-4
 
 
 def test_what_cannot_be_is_told(run: Run, files: Path, stub: FakeMatching) -> None:
