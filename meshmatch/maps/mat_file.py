@@ -25,20 +25,23 @@ _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _ENCODINGS = {1: "latin-1", 2: "latin-1", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 _CELL, _CHAR, _SMALLEST_NUMBER, _LARGEST_NUMBER = 1, 4, 6, 15  # classes of arrays
+_MAX_NAMES = 8  # variables named in a message
 _HINT = "save it with -v7, or as .csv"
+_NAMES_HINT = "name the array of the map 'index' if it counts vertices from 0, or 'matlab_index' if from 1"
 
 
 def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     """Read the named variables, as far as the file contains them and they are numbers, text, or cell arrays of text.
 
-    `InputError` if it is not a MAT-file of level 5, is damaged, or its variables are larger than `LARGEST`.
+    `InputError` if it is not a MAT-file of level 5, is damaged, has none of the variables, or these are larger than
+    `LARGEST`.
     """
     if data[:4] == b"\x89HDF" or data[:10] == b"MATLAB 7.3":
         raise InputError("it is a MAT-file of version 7.3", _HINT)
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise InputError("it is not a MAT-file of version 5 to 7", _HINT)
-    wanted, found = set(names), {}
+    wanted, found, others = set(names), {}, []
     left = min(LARGEST, len(data) + MEMORY_ALLOWANCE // 4)  # up to four copies of the data exist during reading
     try:
         for kind, body in _elements(data[_HEADER:], order):
@@ -52,8 +55,13 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
             name, value = _parse_array(body, order) if kind == _MATRIX else ("", None)
             if name in wanted and value is not None:
                 found[name] = value
+            elif name not in wanted | {""}:
+                others.append(name)
     except (ValueError, StopIteration, zlib.error) as error:
         raise InputError(f"it is damaged: {error or 'something is missing in it'}", _HINT) from error
+    if not found:
+        listed = f"only {', '.join(others[:_MAX_NAMES])}" if others else "nothing usable"
+        raise InputError(f"it has {listed}", _NAMES_HINT)
     return found
 
 

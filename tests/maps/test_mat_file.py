@@ -98,3 +98,14 @@ def test_a_damaged_map_is_told_with_its_name(tmp_path: Path) -> None:
     (tmp_path / "m.mat").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"^m\.mat: "):
         load_map(tmp_path / "m.mat")
+
+
+def test_variables_under_other_names_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "maps.mat"
+    path.write_bytes(written({"C": np.eye(2), "T": np.arange(1, 4)}))
+    with pytest.raises(InputError, match=r"maps\.mat: it has only C, T$") as caught:
+        load_map(path)
+    assert "'index' if it counts vertices from 0, or 'matlab_index' if from 1" in caught.value.hint
+    path.write_bytes(written({"index": {"a": 1}}))
+    with pytest.raises(InputError, match="nothing usable"):
+        load_map(path)
