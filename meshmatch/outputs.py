@@ -117,13 +117,15 @@ def _replacing(path: Path) -> Iterator[Path]:
     (and SIGTERM, which the command line turns into it), the temporary file is removed and whatever was at `path` before
     is untouched. If `path` is a link, its target is replaced, and the link stays.
 
-    `OutputError` if the folder is missing or cannot be written, `path` is a folder or write-protected, or the disk is
-    full.
+    `OutputError` if the folder is missing or cannot be written, `path` is a folder, a pipe, a device or write-protected,
+    or the disk is full.
     """
     final = _resolve_link(path)
     folder = final.parent
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder", "give the name of a file")
+    if final.exists() and not final.is_file():
+        raise OutputError(f"cannot write {path}: it is a pipe or a device", "give the name of a file")
     if final.exists() and not os.access(final, os.W_OK):
         raise OutputError(f"cannot write {path}: it is write-protected", "choose another name with -o")
     if not folder.is_dir():

@@ -91,6 +91,16 @@ def test_a_file_that_is_write_protected_stays(tmp_path: Path, monkeypatch: pytes
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
+def test_a_pipe_stays_one(tmp_path: Path) -> None:
+    """A link to a device too, such as /dev/null: those who may remove it would."""
+    os.mkfifo(tmp_path / "pipe.txt")
+    (tmp_path / "link.txt").symlink_to("pipe.txt")
+    for name in ("pipe.txt", "link.txt"):
+        with pytest.raises(OutputError, match="it is a pipe or a device"), replace_on_success(tmp_path / name):
+            pass
+    assert (tmp_path / "pipe.txt").is_fifo() and len(os.listdir(tmp_path)) == 2
+
+
 @pytest.mark.parametrize(("name", "told"), [("loop.ply", "a link to a file"), ("pipe.ply", "not a regular file")])
 def test_inputs_that_are_no_files(run: Run, tmp_path: Path, name: str, told: str) -> None:
     (tmp_path / "loop.ply").symlink_to("loop.ply")
