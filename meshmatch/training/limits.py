@@ -14,6 +14,7 @@ _MAX_VALUES: dict[str, float] = {
     "scans_per_shape": 256,
     "points": 100_000,
     "workers": 256,
+    "threads": 4096,
     "bodies": 20_000,
     "correct_points": 100_000,
 }

@@ -37,7 +37,14 @@ def test_version(run: Run) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["nonsense"], ["match", "a.ply"], ["match", "a.ply", "b.ply"], ["info", "--nonsense", "a.ply"], ["models", "x"]],
+    [
+        ["nonsense"],
+        ["match", "a.ply"],
+        ["match", "a.ply", "b.ply"],
+        ["info", "--nonsense", "a.ply"],
+        ["models", "x"],
+        ["train", "-o", "model", "--threads", "1000000000"],
+    ],
 )
 def test_a_wrong_command_line_is_2(run: Run, words: list[str]) -> None:
     answer = run(*words)

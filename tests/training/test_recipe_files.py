@@ -144,7 +144,9 @@ def test_a_change_takes_the_numbers_of_arrays() -> None:
     assert people().changed(steps=np.int64(5), rate=np.float32(0.5)) == people().changed(steps=5, rate=0.5)
 
 
-@pytest.mark.parametrize("settings", [{"rate": "x"}, {"workers": "a"}, {"minutes": "a"}, {"loss": None}])
+@pytest.mark.parametrize(
+    "settings", [{"threads": 10**9}, {"rate": "x"}, {"workers": "a"}, {"minutes": "a"}, {"loss": None}]
+)
 def test_settings_of_a_training_are_checked(settings: dict[str, Any]) -> None:
     with pytest.raises(OptionError):
         TrainConfig(**settings)
