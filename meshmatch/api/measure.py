@@ -108,7 +108,7 @@ def measure_inputs(
     `OptionError` if measurements or landmarks are missing for another source.
     """
     if is_body(source):
-        folder = bundled_folder() / "measurements"
+        folder = bundled_folder() / "measurements"  # made by makers/body_measurements.py of commit a77b931897
         own = folder / "body-measurements.csv", folder / "body-landmarks.csv"
         source = resolve_source(source)
         return source, own[0] if measurements is None else measurements, own[1] if landmarks is None else landmarks
