@@ -35,13 +35,13 @@ from meshmatch.experiments.bench.verdict_cases import LIMBS, direction, faces_ke
 from meshmatch.experiments.bench.verdicts import REFUSED, VERDICTS
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
-from meshmatch.generators.bodies import draw_identities, pose_limbs, template_rig
+from meshmatch.generators.bodies import draw_identities, joint_rotations, pose_limbs, template_rig
 from meshmatch.generators.clothes import add_clothes, add_skirts
 from meshmatch.generators.figure import Figure
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.proportions import TOON, draw_style, round_parts, scale_bones
 from meshmatch.generators.rig import forward_kinematics, penetration, skin
-from meshmatch.generators.rotations import DEGREE, rotation_from_vector
+from meshmatch.generators.rotations import DEGREE
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.maps.fit_files import write_fit
@@ -196,10 +196,7 @@ class People:
         nod = torch.stack([draw.normal(0.3 * spine[0], 18), draw.normal(0, 28), draw.normal(0, 14)], -1) * DEGREE
         for name in ("neck01", "neck02", "neck03", "head"):
             vectors[:, rig.joint(name)] = 0.25 * nod
-        rotations = rotation_from_vector(vectors)
-        for index, rotation in matrices.items():
-            rotations[:, index] = rotation
-        return rotations
+        return joint_rotations(vectors, matrices)
 
     def _draw_cut(self, verts: Floats, rng: np.random.Generator) -> tuple[str, Callable[[Floats, Ints], Bools]]:
         """Draw what is cut off.

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 
 from meshmatch.arrays import Float, Floats, Int, Ints
-from meshmatch.generators.bodies import human_source, pose_limbs
+from meshmatch.generators.bodies import human_source, joint_rotations, pose_limbs
 from meshmatch.generators.limbs import Draw, Limbs
 from meshmatch.generators.rig import Rig, cached_rig, forward_kinematics, skin
-from meshmatch.generators.rotations import rotation_from_vector
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.shape import Shape
@@ -87,10 +86,7 @@ def still_pose(
     }
     limbs = Limbs(**{name: torch.full((B,), angle) for name, angle in angles.items()})
     matrices = pose_limbs(vectors, rig, heads, limbs, limbs, MeanDraw(B))
-    rotations = rotation_from_vector(vectors)
-    for index, rotation in matrices.items():
-        rotations[:, index] = rotation
-    return rotations
+    return joint_rotations(vectors, matrices)
 
 
 def standing_body(rig: Rig, pose: str, people: Int[Ints, " N"] | slice = slice(None)) -> Shape:

@@ -10,7 +10,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,7 +23,7 @@ from meshmatch.experiments.makers.human_bodies import diameter, heavy
 from meshmatch.experiments.paper.ablation_views import BASE, HEAVY, TABLE3, Run
 from meshmatch.fields.field import Field, PointField, PointwiseField
 from meshmatch.generators.bodies import human_source
-from meshmatch.generators.generator import Source
+from meshmatch.generators.generator import Source, draw_any
 from meshmatch.maps.evaluate import CM_PER_UNIT
 from meshmatch.models.card import read_card
 from meshmatch.models.deformer import Deformer
@@ -192,10 +192,7 @@ def pool_of(setting: Setting, pose: str, shapes: int = BASE.shapes) -> Pool:
     source, held_out_source = setting.sources(pose)
     generator = torch.Generator().manual_seed(_SEED)
     shapes_drawn = torch.cat([source(min(_BLOCK, shapes - at), generator) for at in range(0, shapes, _BLOCK)])
-
-    def draw(count: int, generator: torch.Generator) -> Tensor:
-        return shapes_drawn[torch.randint(len(shapes_drawn), (count,), generator=generator)]
-
+    draw = partial(draw_any, shapes_drawn)
     model = build_deformer(template, draw, recipe.network, recipe.scan, recipe.kernel, _SEED)
     data = build_dataset(template, draw, model, recipe.scan, _BLOCK, SCANS, _SEED)
     features, targets = [], []
