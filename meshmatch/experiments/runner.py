@@ -159,6 +159,11 @@ def explain(error: MeshmatchError) -> None:
         console.print(f"[dim]hint:[/] {escape(error.hint)}", soft_wrap=True)
 
 
+def cpu_seconds() -> float:
+    """CPU seconds of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
 def log(line: str) -> None:
     """Print a line about the progress on stderr."""
     Console(stderr=True, highlight=False).print(line, markup=False, soft_wrap=True)

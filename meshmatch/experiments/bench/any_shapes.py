@@ -13,7 +13,6 @@ with an error over 20 are reported as ambiguous or poor.
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -241,12 +240,12 @@ def _row(folder: Path, pair: tuple[str, str], mapped: VertexMap) -> dict[str, An
 def measure_by(method: Method, folder: Path, pair: tuple[str, str]) -> dict[str, Any]:
     """Measure error and cost of another method on one pair; a failure counts as the map of everything to vertex 0."""
     source, target = (load_shape(folder / f"{name}.ply") for name in pair)
-    began, failed = os.times(), False
+    began, failed = runner.cpu_seconds(), False
     try:
         index = method.map(source, method.fit(source), target, method.fit(target)).index
     except InputError:
         index, failed = np.zeros(source.V, np.int64), True
-    spent = sum(os.times()[:4]) - sum(began[:4])  # of this process and its children
+    spent = runner.cpu_seconds() - began
     return {"pair": " to ".join(pair), **errors_of(folder, pair, index), "failed": failed, "cpu": spent}
 
 

@@ -7,7 +7,6 @@ the ideal is the second difference of the true path. Lengths are in millimetres.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 from typing import Annotated, Any
@@ -101,11 +100,6 @@ def track_template(fits: Path, work: Path, way: str) -> tuple[Floats, Ints]:
             return arrays["points"], arrays["faces"]
 
 
-def _cpu_seconds() -> float:
-    """CPU seconds of this process and of its children that have ended."""
-    return sum(os.times()[:4])
-
-
 @runner.command
 def main(
     data: runner.Data = runner.DATA,
@@ -119,9 +113,9 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         place = work or Path(temporary)
         true = write_frames(place / "frames", shape, frames, seed)
-        began = _cpu_seconds()
+        began = runner.cpu_seconds()
         Collection(place / "fits", workers=1).fit(place / "frames", model="none", sequence=True)
-        cpu = _cpu_seconds() - began
+        cpu = runner.cpu_seconds() - began
         rows = []
         for way in ("as fitted", "--smooth", "--cycle"):
             points, faces = track_template(place / "fits", place, way)

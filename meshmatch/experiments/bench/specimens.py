@@ -19,7 +19,6 @@ CPU seconds are those of all processes. With ``--work`` a run resumes where it w
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -110,6 +109,12 @@ class Specimens:
         known = any_shapes.distances(self.folder, pair[1])
         ways = [100 * known[way, at] for way in any_shapes.symmetries(self.folder, *pair)]
         return np.asarray(min(ways, key=np.mean))
+
+    def save(self, folder: Path) -> None:
+        """Write the shape of each specimen as a .ply file named after it."""
+        make_folder(folder)
+        for name, specimen in self.each.items():
+            save_shape(folder / f"{name}.ply", specimen.shape)
 
     def lost(self, name: str) -> float:
         """Return the error, in the unit, beyond which a point of this target is lost."""
@@ -289,11 +294,6 @@ def by_meshmonk(some: Specimens, scans: Path, work: Path) -> Done:
     return Done(points)
 
 
-def _cpu_seconds() -> float:
-    """CPU seconds of this process and of its children that have ended."""
-    return sum(os.times()[:4])
-
-
 def sides_found(some: Specimens, done: Done) -> float | None:
     """Share of specimens, or of pairs, whose side is found; the side of the template does not matter."""
     if not any(each.mirrored for each in some.each.values()):
@@ -311,12 +311,10 @@ def measure(
     """Run a method on a set and return its table row."""
     some = load(name, data, count, seed)
     scans, place = work / "scans" / name, work / "fits" / f"{name}-{method}"
-    make_folder(scans)
-    for key, each in some.each.items():
-        save_shape(scans / f"{key}.ply", each.shape)
+    some.save(scans)
     exact = {key: load_shape(scans / f"{key}.ply").verts - each.shape.verts for key, each in some.each.items()}
     assert max(float(np.abs(off).max()) for off in exact.values()) < 1e-3
-    began = _cpu_seconds()
+    began = runner.cpu_seconds()
     ways: dict[str, Callable[[Specimens, Path, Path], Done]] = {
         NO_MODEL: partial(by_collection, model=NO_MODEL),
         "own": partial(by_own_model, steps=steps),
@@ -324,12 +322,12 @@ def measure(
         "meshmonk": by_meshmonk,
     }
     done = ways[method](some, scans, place)
-    cpu = _cpu_seconds() - began
+    cpu = runner.cpu_seconds() - began
     means, lost, on_cut = {}, [], []
     for pair in runner.evenly_spread(list(permutations(some.each, 2)), limit if method == PAIRS else None):
-        began = _cpu_seconds()
+        began = runner.cpu_seconds()
         arrived = done.points(pair)
-        cpu += _cpu_seconds() - began
+        cpu += runner.cpu_seconds() - began
         errors = some.errors(pair, arrived)
         errors = errors[np.isfinite(errors)]
         means[pair] = float(errors.mean())

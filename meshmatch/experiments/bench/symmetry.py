@@ -35,9 +35,7 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.geometry.triangles import interpolate
 from meshmatch.maps.footpoints import Surface
 from meshmatch.models.registry import NO_MODEL
-from meshmatch.outputs import make_folder
 from meshmatch.shapes.decimate import decimate
-from meshmatch.shapes.files import save_shape
 from meshmatch.templates.mirror_images import aligned_mirror_image
 
 PYCLARCS = "pyclarcs"
@@ -118,9 +116,7 @@ def measure(name: str, method: str, data: Path, seed: int, work: Path) -> dict[s
     some = load(name, data, any_shapes.SHAPES, seed)
     assert some.folder is not None
     scans = work / "scans" / name
-    make_folder(scans)
-    for key, each in some.each.items():
-        save_shape(scans / f"{key}.ply", each.shape)
+    some.save(scans)
     ways: dict[str, Callable[[Specimens, Path, Path], Counterparts]] = {
         NO_MODEL: by_fits,
         ALONE: by_single_shapes,
