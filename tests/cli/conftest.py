@@ -1,5 +1,6 @@
 """Fixtures that run the command line: arguments in; status, stdout and stderr out."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +33,12 @@ class Answer:
     status: int
     out: str
     err: str
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The JSON record of a command that succeeded."""
+        found: dict[str, Any] = json.loads(well(self).out)
+        return found
 
 
 Run = Callable[..., Answer]

@@ -41,8 +41,7 @@ def test_a_folder_of_meshes_becomes_an_atlas(run: Run, shapes: Path, tmp_path: P
     groups = [group(tmp_path / f"{name}.txt", range(4 * k, 4 * k + 4)) for k, name in enumerate(names)]
     words = ("atlas", shapes, "-o", output, "--groups", *groups, "--samples", 2, "--modes", 2, "--seed", 3, "--json")
     answer = run(*words)
-    assert answer.status == 0
-    told = json.loads(answer.out)
+    told = answer.record
     assert told["output"] == str(output)
     assert sorted(told["files"]) == sorted(path.name for path in output.iterdir())
     assert (told["shapes"], told["modes"], told["seed"]) == (8, 2, 3)
@@ -87,7 +86,7 @@ def test_a_model_is_explained(run: Run, shapes: Path, tmp_path: Path) -> None:
     shutil.rmtree(output)
     answer = run(*words, "--model", "form ~ age", "--json", "-q")
     assert "egg-0: left out of the model, as its age is missing" in answer.err
-    told = json.loads(answer.out)["model"]
+    told = answer.record["model"]
     assert (told["formula"], told["shapes"], told["permutations"]) == ("form ~ age", 7, 100)
     assert told["left_out"] == {"egg-0": "age"}
     (age,) = told["terms"]
@@ -114,7 +113,7 @@ def test_a_shape_unlike_the_others_is_told(run: Run, shapes: Path, tmp_path: Pat
     words = ("atlas", shapes, "--no-measures", "--permutations", 9, "--model", "form ~ size", "--format", "svg")
     answer = run(*words, "-o", tmp_path / "a", "--json", "-q")
     assert "warning: egg-2: unlike the others, and 86 % of mode 1" in answer.err
-    told = json.loads(answer.out)
+    told = answer.record
     assert told["outliers"] == ["egg-2"]
     charts = {"allometry.svg", "components.svg", "histogram.svg", "scree.svg"}
     assert charts <= set(told["files"])
@@ -128,7 +127,7 @@ def test_shapes_of_parts_are_superimposed_by_one(run: Run, tmp_path: Path) -> No
         verts = np.concatenate([ball.verts * [1, 1.3, 2], 0.5 * ball.verts + [0, 2 * rng.standard_normal(), 4]])
         save_shape(folder / f"{k}.ply", Shape(verts, np.concatenate([ball.faces, ball.faces + ball.V])))
     answer = run("atlas", folder, "-o", tmp_path / "a", "--align-by", "1", "--no-measures", "--json")
-    assert answer.status == 0 and json.loads(answer.out)["align_by"] == "1"
+    assert answer.record["align_by"] == "1"
     found = Atlas.load(tmp_path / "a")
     assert len(found.modes) == 1 and np.abs(found.modes[0, : ball.V]).max() < 1e-6
     assert np.ptp(found.modes[0, ball.V :], axis=0) == pytest.approx(0, abs=1e-6)  # the other one moves as a whole

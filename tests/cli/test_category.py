@@ -1,6 +1,5 @@
 """From a folder without correspondence to a map, through the program's only door."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,7 +47,7 @@ def test_prepare_says_what_it_chose_and_what_kind_the_shapes_are(
     seen: list[dict[str, Path]] = []
     monkeypatch.setattr(kinds, "kinds_of", lambda files, *_: seen.append(files) or dict.fromkeys(files, "hand"))
     answer = run("prepare", eggs, "-o", tmp_path / "out", *FEW[:-1], "--mirror", "no", "--json")
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["registered"], record["align"], record["scale"], record["landmarks"]) == (0, "rigid", "area", 0)
     assert "which lies nearest to all others" in answer.err
     assert "3 shapes without correspondence" in answer.err
@@ -122,7 +121,7 @@ def test_from_few_registered_shapes_to_a_map(run: Run, tmp_path: Path, monkeypat
     for n in range(3):
         save_shape(folder / f"egg{n}.ply", Shape(ball.verts * [0.8, 1.4 + 0.1 * n, 1.0], ball.faces))
     answer = run("prepare", folder, "-o", tmp_path / "out", *FEW[:-1], "--json")
-    assert json.loads(answer.out)["align"] == "near"
+    assert answer.record["align"] == "near"
     words = ("--steps", "3", "--seed", "2", "--stiffness", "0.1")
     answer = run("train", "--shapes", tmp_path / "out", "-o", tmp_path / "mine", *words)
     assert answer.status == 0 and "after step 3;" in answer.err

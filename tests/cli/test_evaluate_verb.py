@@ -1,6 +1,5 @@
 """`evaluate` measures what a map file says against shapes and truth."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -55,9 +54,9 @@ def test_without_truth_it_says_coverage_and_distortion(evaluate: Callable[[str],
 def test_with_the_map_back_it_says_where_both_lead(evaluate: Callable[[str], Answer], folder: Path) -> None:
     shown = evaluate("--backward map.npy").out
     assert "bijectivity" in shown and "dirichlet" in shown
-    record = json.loads(evaluate("--backward map.npy --json").out)
+    record = evaluate("--backward map.npy --json").record
     assert 0.0 < record["bijectivity"] < 0.2 and record["dirichlet"] > 1.0
-    assert json.loads(evaluate("--json").out)["bijectivity"] is None
+    assert evaluate("--json").record["bijectivity"] is None
 
 
 @pytest.mark.parametrize(
@@ -68,7 +67,7 @@ def test_with_the_map_back_it_says_where_both_lead(evaluate: Callable[[str], Ans
     ],
 )
 def test_every_form_of_the_truth_gives_the_same_errors(evaluate: Callable[[str], Answer], truth: str) -> None:
-    record = json.loads(evaluate(f"{truth} --json").out)
+    record = evaluate(f"{truth} --json").record
     assert (record["points"], record["unit"], record["median"], record["median_cm"]) == (V, "file", 0.0, 0.0)
     assert record["mean_cm"] > 1.0  # a tenth of the vertices, thrown across the sphere
     assert 0.05 < record["share_over_threshold"] <= 64 / V
@@ -78,7 +77,7 @@ def test_every_form_of_the_truth_gives_the_same_errors(evaluate: Callable[[str],
 def test_vertices_without_a_counterpart_are_left_out(run: Run, folder: Path, nothing: str) -> None:
     Path("column.txt").write_text("\n".join(nothing if i % 2 else str(i) for i in range(V)))
     answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--truth", "column.txt", "--json"))
-    assert json.loads(answer.out)["points"] == V // 2
+    assert answer.record["points"] == V // 2
     assert f"column.txt: {V // 2} of {V} vertices have no counterpart: left out" in answer.err
 
 
@@ -95,14 +94,12 @@ def test_landmarks_of_both_shapes_are_a_truth(run: Run, folder: Path) -> None:
     Path("a.fcsv").write_text(fcsv("notch", "condyle", "groove"))
     Path("b.csv").write_text("name,x,y,z\n" + "\n".join(f"{name},{x},{y},{z}" for name, (x, y, z) in rows))
     answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--points", "a.fcsv", "b.csv", "--json"))
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["points"], record["mean"]) == (2, 0.0)
     assert "a.fcsv: b.csv has no condyle: left out" in answer.err and "b.csv: a.fcsv has no spur" in answer.err
     Path("other.csv").write_text("name,vertex\nA,0\nB,1\nC,2")
     answer = well(run("evaluate", "map.npy", "a.ply", "b.ply", "--points", "a.fcsv", "other.csv", "--json"))
-    assert (
-        json.loads(answer.out)["mean"] == 0.0 and "no name in common: their landmarks are paired in order" in answer.err
-    )
+    assert answer.record["mean"] == 0.0 and "no name in common: their landmarks are paired in order" in answer.err
 
 
 def test_pairs_are_a_truth_in_python_too(folder: Path) -> None:
@@ -118,14 +115,14 @@ def test_truth_about_good_vertices_alone_is_0(evaluate: Callable[[str], Answer],
 
 
 def test_errors_are_in_the_unit_of_the_file_unless_it_is_a_person(evaluate: Callable[[str], Answer]) -> None:
-    record = json.loads(evaluate("--truth column.txt --json").out)
+    record = evaluate("--truth column.txt --json").record
     size = float(np.sqrt(load_shape("b.ply").area))
     assert record["mean"] == pytest.approx(record["mean_x100"] / 100 * size) and record["mean"] > 0
     assert record["threshold"] == pytest.approx(0.1 * size)
     assert f"over {0.1 * size:.3g} (unit of the file)" in evaluate("--truth column.txt").out
     shown = evaluate("--truth column.txt --unit x100 --threshold 1234.5").out
     assert "over 1234.5 x 0.01 sqrt(area)" in shown and shown.splitlines()[0].count("sqrt(area)") == 1
-    asked = json.loads(evaluate("--truth column.txt --unit cm --json").out)
+    asked = evaluate("--truth column.txt --unit cm --json").record
     assert (asked["unit"], asked["threshold"], asked["mean"]) == ("cm", 15.0, record["mean_cm"])
 
 
@@ -148,8 +145,7 @@ def test_unit_counts_without_truth(folder: Path) -> None:
 
 def test_threshold(evaluate: Callable[[str], Answer]) -> None:
     all_wrong, none = (
-        json.loads(evaluate(f"--truth column.txt --threshold {limit} --json").out)["share_over_threshold"]
-        for limit in (0, 1000)
+        evaluate(f"--truth column.txt --threshold {limit} --json").record["share_over_threshold"] for limit in (0, 1000)
     )
     # vertex 0 itself may be among those thrown to it, and is right
     assert 63 / V <= all_wrong <= 64 / V and none == 0.0
@@ -163,7 +159,7 @@ def test_a_threshold_is_a_length(run: Run, folder: Path) -> None:
 
 
 def test_seed_chooses_the_pairs_of_the_distortion(evaluate: Callable[[str], Answer]) -> None:
-    values = [json.loads(evaluate(f"--seed {seed} --json").out)["distortion"] for seed in "010"]
+    values = [evaluate(f"--seed {seed} --json").record["distortion"] for seed in "010"]
     assert values[0] == values[2] != values[1]
 
 

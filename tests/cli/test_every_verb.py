@@ -203,14 +203,14 @@ def test_files_of_one_name_are_told_apart(run: Run, files: Path, stub: FakeMatch
     Path("other/a.ply").write_bytes(Path("b.ply").read_bytes())
     words = call(verb, "--json")
     words[words.index("b.ply")] = "other/a.ply"
-    record = json.loads(run(*words).out)
+    record = run(*words).record
     assert (record["source"], record["target"]) == ("a.ply", "other/a.ply")
 
 
 @pytest.mark.parametrize("verb", EVERY)
 def test_the_keys_that_verbs_share_are_on_the_page(run: Run, files: Path, stub: FakeMatching, verb: str) -> None:
     page = (ROOT / "docs" / "reference" / "cli.md").read_text(encoding="utf-8")
-    record = json.loads(run(*call(verb, "--json")).out)
+    record = run(*call(verb, "--json")).record
     assert {key for key in record if f"`{key}`" in page} >= {"output", "verdict", "reasons", "model", "seed", "seconds"}
     assert [key for fit in record.get("fits", ()) for key in fit if f"`{key}`" not in page] == []
     assert set(record.get("distance", {})) <= {"mean", "most", "unit"}

@@ -35,7 +35,7 @@ def test_a_body_is_measured_in_the_unit_of_its_file(run: Run, copies: Shape) -> 
     with Path("out.csv").open(newline="") as file:
         rows = {row["name"]: row for row in csv.DictReader(file)}
     assert len(rows) == 30 and float(rows["waist girth"]["value"]) == pytest.approx(2 * 0.786, abs=0.01)
-    record = json.loads(answer.out)
+    record = answer.record
     assert record["measurements"]["waist girth"] == pytest.approx(float(rows["waist girth"]["value"]))
     assert (record["missing"], record["map"]) == (0, None) and Path("out.png").stat().st_size > 10_000
     assert "30 measurements of large.ply, in the unit of its file" in answer.err

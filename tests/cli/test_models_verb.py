@@ -31,7 +31,7 @@ SHIPPED = ["hand", "head", "human", "quadruped"]
 
 
 def names(run: Run) -> list[str]:
-    return [entry["name"] for entry in json.loads(run("models", "list", "--json").out)["models"]]
+    return [entry["name"] for entry in run("models", "list", "--json").record["models"]]
 
 
 def test_list_knows_the_model_that_ships(run: Run) -> None:
@@ -47,7 +47,7 @@ def test_list_knows_the_model_that_ships(run: Run) -> None:
 
 
 def test_show_is_the_card(run: Run) -> None:
-    card = json.loads(run("models", "show", "human").out)
+    card = run("models", "show", "human").record
     assert card["name"] == "human"
     assert {"data", "licence", "recipe", "metrics", "weights_sha256", "template_hash"} <= card.keys()
     line = run("models", "show", "human", "--json").out
@@ -118,7 +118,7 @@ def test_what_is_no_model_is_not_added(run: Run, tmp_path: Path) -> None:
 
 
 def test_json_of_every_verb(run: Run, mine: Path, home: Path) -> None:
-    added = json.loads(run("models", "add", mine, "--json").out)
+    added = run("models", "add", mine, "--json").record
     assert added == {"added": "mine", "folder": str(home / "models" / "mine")}
     (home / "models" / "mine" / "weights.safetensors").write_bytes(b"")
     answer = run("models", "verify", "--json")
@@ -128,4 +128,4 @@ def test_json_of_every_verb(run: Run, mine: Path, home: Path) -> None:
     assert len(checked["human"]["sha256"]) == 64
     assert checked["mine"]["sha256"] is None
     assert "is damaged" in checked["mine"]["problem"]
-    assert json.loads(run("models", "remove", "mine", "--json").out) == {"removed": "mine"}
+    assert run("models", "remove", "mine", "--json").record == {"removed": "mine"}

@@ -171,4 +171,4 @@ def test_what_a_file_says_commands_no_terminal(run: Run, tmp_path: Path, cube: S
         assert not any(ord(letter) < 32 or 126 < ord(letter) < 160 for line in lines for letter in line)
         assert not any(line.startswith("error: me") for line in lines)
     assert [answer.status for answer in answers] == [0, 0, 0]
-    assert json.loads(answers[1].out)["reasons"] == [bad]
+    assert answers[1].record["reasons"] == [bad]

@@ -64,8 +64,7 @@ class Drawn:
         """What is told of a picture that went well."""
         answer = well(self.run("picture", *words.split(), "-o", "o.png", "--json"))
         self.err = answer.err
-        record: dict[str, Any] = json.loads(answer.out)
-        return record
+        return answer.record
 
     @property
     def names(self) -> list[str]:
@@ -93,7 +92,7 @@ def test_a_picture_of_a_shape(run: Run, files: Path) -> None:
     answer = well(run("picture", "a.ply", "-o", "out.png", "--size", "96x80", "--json"))
     assert answer.err.splitlines() == ["drew out.png: 1 shape (96 x 80 pixels)"]
     expected = {"output": "out.png", "shapes": ["a.ply"], "width": 96, "height": 80, "shows": "1 shape"}
-    assert json.loads(answer.out) == expected
+    assert answer.record == expected
     with Image.open("out.png") as image:
         picture = np.asarray(image)
     assert picture.shape[:2] == (80, 96)

@@ -1,6 +1,5 @@
 """symmetry through the program's only door; what lies across is made up."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ def test_map_and_asymmetry_are_written(run: Run, called: dict[str, Any], sphere:
     values = load_values(Path("apart.csv"), sphere)
     assert values.names == NAMES
     assert values.numbers[0].tolist() == [0.5, 0.5, 1.0, 1.5]
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["normal"], record["offset"], record["verdict"]) == ([1.0, 0.0, 0.0], 0.125, "good")
     assert record["asymmetry"]["mean"] == pytest.approx(0.25, abs=0.01) and record["notes"] == ["mended"]
     assert "x . (1 0 0) = 0.125" in answer.err

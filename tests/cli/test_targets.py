@@ -78,7 +78,7 @@ def test_every_verb_takes_a_folder(run: Run, files: Path, stub: FakeMatching, ve
     garment = ("worn.obj",) if verb == "transfer-garment" else ()
     answer = well(run(verb, *garment, "a.ply", "in", "-o", "out", *MORE.get(verb, ()), "--json"))
     assert {str(path.relative_to("out")) for path in Path("out").rglob("*.*")} >= {*VERBS[verb], "transfers.csv"}
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["output"], record["table"], record["verdicts"]) == ("out", "out/transfers.csv", {"good": 2})
     assert [each["name"] for each in record["targets"]] == ["b", "sub/c"]
     assert [each["source"] for each in record["targets"]] == ["a.ply", "a.ply"]
@@ -96,7 +96,7 @@ def test_what_is_finished_is_kept(run: Run, files: Path, stub: FakeMatching, mon
     before = {path: path.read_bytes() for path in Path("out").rglob("*.npy")}
     answer = well(run(*LABELS, "--json", "--threads", "1"))
     assert (seen, "kept" in answer.err) == ([], True)
-    assert [each["kept"] for each in json.loads(answer.out)["targets"]] == [True, True]
+    assert [each["kept"] for each in answer.record["targets"]] == [True, True]
     assert before == {path: path.read_bytes() for path in Path("out").rglob("*.npy")} != {}
     Path("out/b.npy").unlink()
     well(run(*LABELS))

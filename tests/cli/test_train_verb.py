@@ -1,6 +1,5 @@
 """`train` hands everything on to the training run; the run itself has tests of its own."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -270,7 +269,7 @@ def test_a_prepared_folder_brings_its_template(
 
 def test_json(run: Run, stub: Recorder, tmp_path: Path) -> None:
     answer = run("train", "-o", tmp_path / "mine", "--json", "--quiet")
-    record = json.loads(answer.out)
+    record = answer.record
     assert answer.err == ""
     assert (record["model"], record["steps"]) == ("mine", 2)
     assert "metrics" in record
@@ -332,7 +331,7 @@ def test_the_losses_as_a_picture(run: Run, stub: Recorder, tmp_path: Path, monke
         "validation": {1: 0.04, 2: 0.0321},
     }
     assert f"drew {picture}" in answer.err
-    assert json.loads(answer.out)["picture"] == str(picture)
+    assert answer.record["picture"] == str(picture)
     drawn.clear()
     monkeypatch.setenv("RANK", "1")
     assert run("train", "-o", tmp_path / "mine", "--picture", picture).status == 0

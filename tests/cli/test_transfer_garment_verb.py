@@ -1,6 +1,5 @@
 """transfer-garment through the program's only door; the map is made by construction."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_sleeve_on_a_bent_rod(run: Run, files: Path) -> None:
     answer = well(run(*CALL, "-o", "out.obj", "--json", "--picture", "worn.png"))
     assert "wrote out.obj wool.mtl: sleeve.obj on bent.ply" in answer.err
-    found = json.loads(answer.out)
+    found = answer.record
     assert found["files"] == ["out.obj", "wool.mtl"]
     assert (found["vertices"], found["below_skin"], found["map"]) == (sleeve().V, 0, "map.npz")
     assert Path("wool.mtl").read_bytes() == Path("given/wool.mtl").read_bytes()

@@ -1,6 +1,5 @@
 """The pictures of transfer-color, -labels, -weights, -landmarks and -texture."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> Drawn:
 @pytest.mark.parametrize("noun", OUTPUT)
 def test_a_picture_of_both_shapes(run: Run, pair: Path, noun: str) -> None:  # noqa: F811
     answer = well(run(*call(f"{noun} --picture p.png --json")))
-    assert json.loads(answer.out)["picture"] == "p.png"
+    assert answer.record["picture"] == "p.png"
     assert "drew p.png: both shapes with what was transferred" in answer.err
     with Image.open("p.png") as image:
         pixels = np.asarray(image)
@@ -48,7 +47,7 @@ def test_a_picture_of_both_shapes(run: Run, pair: Path, noun: str) -> None:  # n
     left, right = np.split(pixels, [image.size[0] // 2], axis=1)
     assert (left < 240).any(axis=2).mean() > 0.1
     assert (right < 240).any(axis=2).mean() > 0.1
-    assert json.loads(well(run(*call(f"{noun} --json"))).out)["picture"] is None
+    assert run(*call(f"{noun} --json")).record["picture"] is None
 
 
 def test_colors_and_numbers(run: Run, pair: Path, drawn: Drawn) -> None:  # noqa: F811

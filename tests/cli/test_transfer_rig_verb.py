@@ -1,6 +1,5 @@
 """transfer-rig through the program's only door."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ def pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_rig_by_a_map(run: Run, pair: Path) -> None:
     answer = well(run(*CALL, "--map", "ab.npz", "--json", "--picture", "p.png"))
-    record = json.loads(answer.out)
+    record = answer.record
     assert record.items() >= {
         ("output", "rigged.glb"), ("picture", "p.png"), ("pose", "rest"), ("joints", 4), ("replaced_joints", 0),
         ("source", "a.glb"), ("target", "b.ply"), ("map", "ab.npz"), ("verdict", "good"),
@@ -67,7 +66,7 @@ def test_joints_without_a_vertex_are_named(run: Run, pair: Path) -> None:
     nearest = np.linalg.norm(a.verts[:, None] - b.verts[None], axis=2).argmin(axis=1)
     save_map("low.npz", VertexMap.between(a, b, nearest, confidence=(a.verts[:, 1] < 1.5).astype("f4")))
     answer = well(run(*CALL, "--map", "low.npz", "--json"))
-    assert json.loads(answer.out)["unused_joints"] == ["foot"]
+    assert answer.record["unused_joints"] == ["foot"]
     assert "warning: 1 joint that moves a.glb has no vertex on the target: foot\n" in answer.err
 
 

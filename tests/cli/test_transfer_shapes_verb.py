@@ -1,6 +1,5 @@
 """transfer-shapes through the program's only door; maps are made by construction."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +59,7 @@ def true_moves() -> np.ndarray:
 
 def test_shapes_into_a_glb(run: Run, pair: Path) -> None:
     answer = well(run(*CALL, "-o", "out.glb", "--json", "--picture", "p.png"))
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["shapes"], record["still"], record["clips"]) == (list(NAMES), [], ["breathe"])
     assert "wrote out.glb: b.ply with 3 blendshapes, 1 clip (" in answer.err
     assert Path("p.png").stat().st_size > 1000
@@ -91,7 +90,7 @@ def test_an_obj_keeps_its_texture_in_a_glb(run: Run, pair: Path) -> None:
 
 def test_shapes_into_arrays(run: Run, pair: Path) -> None:
     answer = well(run(*CALL, "-o", "out.npz", "--json"))
-    assert json.loads(answer.out)["clips"] == []
+    assert answer.record["clips"] == []
     assert "warning: out.npz cannot contain clips: breathe\n" in answer.err and "3 blendshapes (" in answer.err
     found = load_blend_shapes("out.npz", load_shape("b.ply"))
     assert found.names == NAMES
@@ -140,7 +139,7 @@ def test_shapes_from_meshes(run: Run, pair: Path) -> None:
     save_map("ab.npz", VertexMap.between(load_shape("a.obj"), load_shape("b.ply"), np.arange(shape.V)))
     words = "transfer-shapes", "a.obj", "b.ply", "--map", "ab.npz"
     answer = well(run(*words, "-o", "out.npz", "--shapes", "expressions", "--json"))
-    assert json.loads(answer.out)["shapes"] == ["lift", "swell"]
+    assert answer.record["shapes"] == ["lift", "swell"]
     found = load_blend_shapes("out.npz", load_shape("b.ply"))
     assert np.allclose(found.moves, true_moves()[[1, 0]], atol=0.02)
     well(run(*words, "-o", "out.npz", "--shapes", "expressions/swell.ply", "--shapes", "expressions/lift.ply", "-q"))

@@ -1,10 +1,8 @@
 """transfer-texture through the program's only door. Maps are made by construction; the last test alone matches."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +23,7 @@ from meshmatch.shapes.textured_files import load_appearance
 from meshmatch.templates.location import bundled_folder
 from meshmatch.transfer.texels import draw_triangles
 from meshmatch.transfer.unwrap import unwrapped
-from tests.cli.conftest import Answer, Run, refused, well
+from tests.cli.conftest import Run, refused, well
 from tests.conftest import icosphere
 from tests.shapes.painted import FACES, encoded, quarters, write_gltf, write_square_obj
 from tests.transfer.known import split
@@ -60,11 +58,6 @@ def call(words: str = "", target: str = "b.ply", out: str = "out.glb", map: str 
     """The whole call, with these options."""
     given = [] if map is None else ["--map", map]
     return ["transfer-texture", "a.glb", target, "-o", out, *given, *SMALL, *words.split()]
-
-
-def told(answer: Answer) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(well(answer).out)
-    return record
 
 
 def seen(path: str, at: np.ndarray) -> np.ndarray:
@@ -112,7 +105,7 @@ def test_a_finer_copy_shows_the_same(run: Run, pair: Path, out: str) -> None:
 
 def test_json_says_all_of_it(run: Run, pair: Path) -> None:
     answer = run(*call("--json -q", out="out.obj"))
-    record = told(answer)
+    record = answer.record
     assert answer.err == ""
     assert record["files"] == ["out.obj", "out.mtl", "out.png"]
     assert (record["size"], record["uv"], record["alpha"]) == (64, "new", "opaque")
@@ -129,7 +122,7 @@ def test_the_targets_own_coordinates_are_used_replaced_or_demanded(run: Run, pai
     own = unwrapped(b, 64, 2)[..., ::-1].copy()  # new ones would be the same but for that
     save_textured("b.glb", TexturedMesh(b.verts, b.faces, own), picture())
     save_map("ab2.npz", VertexMap.between(load_shape("a.glb"), load_shape("b.glb"), load_map("ab.npz").index))
-    assert told(run(*call(f"--uv {uv} --json", target="b.glb", map="ab2.npz")))["uv"] == used
+    assert run(*call(f"--uv {uv} --json", target="b.glb", map="ab2.npz")).record["uv"] == used
     found = load_appearance("out.glb", load_shape("out.glb")).uv
     assert (found.shape == own.shape and np.allclose(found, own, atol=1e-6)) == (used == "own")
 
@@ -147,7 +140,7 @@ def test_overlapping_coordinates_are_replaced_with_a_note(run: Run, pair: Path) 
     save_textured("b.obj", TexturedMesh(b.verts, b.faces, folded(b)), picture())
     save_map("ab2.npz", replace(load_map("ab.npz"), target_hash=load_shape("b.obj").hash))
     answer = run(*call("--json", target="b.obj", map="ab2.npz"))
-    assert told(answer)["uv_note"]
+    assert answer.record["uv_note"]
     assert "note: b.obj: its own texture coordinates cannot be used: they overlap" in answer.err
     before = {path.name for path in pair.iterdir()}
     refused(run(*call("--uv keep --quiet", target="b.obj", map="ab2.npz")), "they overlap", pair, before)
@@ -165,7 +158,7 @@ def test_mirrored_coordinates_are_used_where_both_halves_look_alike(run: Run, pa
     save_textured("b.obj", TexturedMesh(b.verts, b.faces, laid), picture())
     words = ["transfer-texture", "a.ply", "b.obj", "-o", output, "--map", "ab2.npz", *SMALL, "--uv", "keep", "--json"]
     answer = run(*words)
-    assert told(answer)["uv"] == "own"
+    assert answer.record["uv"] == "own"
     assert "% of their texels to several places, as to mirrored halves; these look alike" in answer.err
     out = load_shape(output)
     found = load_appearance(output, out)
@@ -193,7 +186,7 @@ def tiled(name: str) -> None:
 def test_each_tile_of_the_target_gets_an_image(run: Run, pair: Path) -> None:
     tiled("b.obj")
     answer = well(run(*call("--uv keep --json", "b.obj", "out.obj")))
-    record = told(answer)
+    record = answer.record
     assert record["uv"] == "own" and record["tiles"] == [1001, 1002]
     files = ["out.obj", "out.mtl", "out.1001.png", "out.1002.png"]
     assert record["files"] == files and all(Path(file).exists() for file in files)
@@ -215,7 +208,7 @@ def test_each_tile_of_the_target_gets_an_image(run: Run, pair: Path) -> None:
 def test_a_glb_has_no_tiles(run: Run, pair: Path) -> None:
     tiled("b.obj")
     answer = well(run(*call("--json", "b.obj", "out.glb")))
-    assert told(answer)["uv"] == "new" and "has no tiles (UDIM)" in answer.err
+    assert answer.record["uv"] == "new" and "has no tiles (UDIM)" in answer.err
     before = {path.name for path in pair.iterdir()}
     refused(run(*call("--uv keep --quiet", "b.obj", "no.glb")), "they overlap", pair, before)
 
@@ -223,7 +216,7 @@ def test_a_glb_has_no_tiles(run: Run, pair: Path) -> None:
 def test_the_layout_of_the_source_is_carried_over(run: Run, pair: Path) -> None:
     """The image that comes out is that of the source."""
     answer = run(*call("--uv source --json"))
-    assert told(answer)["uv"] == "source"
+    assert answer.record["uv"] == "source"
     assert "note: the layout of a.glb (" in answer.err and "texture coordinates of the source: " in answer.err
     before, after = (load_appearance(name, load_shape(name)) for name in ("a.glb", "out.glb"))
     assert np.abs(np.sort(before.uv.mean(axis=(0, 1))) - np.sort(after.uv.mean(axis=(0, 1)))).max() < 0.02
@@ -257,28 +250,28 @@ def doubtful(pair: Path) -> None:
 
 def test_doubt_is_kept_filled_or_left_blank(run: Run, doubtful: None) -> None:
     kept = run(*call("--json", map="doubt.npz"))
-    assert told(kept)["low_confidence_share"] == pytest.approx((1 - 0.3) / 2, abs=0.08)  # of a sphere, above z = 0.3
+    assert kept.record["low_confidence_share"] == pytest.approx((1 - 0.3) / 2, abs=0.08)  # of a sphere, above z = 0.3
     assert "has less confidence than 0.3: kept" in kept.err
     top = np.array([[0.0, 0.0, 1.0]])
     was = seen("out.glb", top)
 
-    record = told(run(*call("--json --fill", map="doubt.npz")))
+    record = run(*call("--json --fill", map="doubt.npz")).record
     assert record["filled_share"] == record["low_confidence_share"]
     assert (seen("out.glb", top) != was).any()
     answer = run(*call("--json --blank #ff0080", map="doubt.npz"))
-    assert told(answer)["blank_share"] > 0.2 and "left blank" in answer.err
+    assert answer.record["blank_share"] > 0.2 and "left blank" in answer.err
     np.testing.assert_array_equal(seen("out.glb", top), [[255, 0, 128]])
-    assert told(run(*call("--json --blank 0", map="doubt.npz")))["alpha"] == "mask"
+    assert run(*call("--json --blank 0", map="doubt.npz")).record["alpha"] == "mask"
     assert load_appearance("out.glb", load_shape("out.glb")).materials[0].alpha == "mask"
-    assert told(run(*call("--json --min-confidence 0", map="doubt.npz")))["low_confidence_share"] == 0
+    assert run(*call("--json --min-confidence 0", map="doubt.npz")).record["low_confidence_share"] == 0
 
 
 def test_doubt_about_vertex_colors(run: Run, doubtful: None) -> None:
-    assert told(run(*call("--json --blank 1,0,0", map="doubt.npz", out="out.ply")))["blank"] > 0
+    assert run(*call("--json --blank 1,0,0", map="doubt.npz", out="out.ply")).record["blank"] > 0
     colors = load_shape("out.ply").colors
     assert colors is not None
     np.testing.assert_array_equal(colors[load_shape("b.ply").verts[:, 2].argmax(), :3], [1, 0, 0])
-    assert told(run(*call("--json --fill", map="doubt.npz", out="out.ply")))["filled"] > 0
+    assert run(*call("--json --fill", map="doubt.npz", out="out.ply")).record["filled"] > 0
 
 
 @pytest.mark.parametrize(
@@ -289,7 +282,7 @@ def test_clouds_and_ply_get_vertex_colors(run: Run, pair: Path, target: str, out
     np.save("b.npy", b.verts)
     save_map("ab.npz", VertexMap.between(load_shape("a.glb"), load_shape(target), load_map("ab.npz").index))
     answer = run(*call("--json", target=target, out=out))
-    assert told(answer)["files"] == [out] and not Path("a.mtl").exists()
+    assert answer.record["files"] == [out] and not Path("a.mtl").exists()
     assert "with vertex colors" in answer.err
     found = load_shape(out)
     assert found.colors is not None and np.ptp(found.colors[:, :3]) > 0.5
@@ -304,7 +297,7 @@ def test_a_map_tells_how_the_target_stands(run: Run, pair: Path, target: str) ->
     save_shape("a.ply", replace(load_shape("a.glb"), colors=np.ones((load_shape("a.glb").V, 4))))
     a, index = load_shape("a.ply"), load_map("ab.npz").index
     save_map("up.npz", VertexMap.between(a, load_shape(target), index, target_up="+z"))
-    told(run("transfer-texture", "a.ply", target, "-o", "out.glb", "--map", "up.npz", *SMALL, "--json"))
+    well(run("transfer-texture", "a.ply", target, "-o", "out.glb", "--map", "up.npz", *SMALL, "--json"))
     upright = load_shape("out.glb").verts[: b.V]
     np.testing.assert_allclose(upright, b.verts @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-5)
 
@@ -454,7 +447,7 @@ def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path, monkeypatch
         "transfer-texture", samples / "dancer-textured.glb", samples / "climber.ply", "-o", "out.glb",
         *("--size", "256", "--refine", "none", "--seed", "1", "--json"),
     )  # fmt: skip
-    record = json.loads(well(answer).out)
+    record = answer.record
     assert "matched dancer-textured.glb to climber.ply" in answer.err
     assert record["verdict"] in ("good", "fair", "poor")
     assert record["model"] == "human" and record["seed"] == 1

@@ -3,11 +3,9 @@
 Maps are made by construction; the last test alone matches.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ from meshmatch.transfer.label_files import load_labels
 from meshmatch.transfer.landmarks import load_landmarks
 from meshmatch.transfer.value_files import load_values
 from meshmatch.transfer.weight_files import load_weights
-from tests.cli.conftest import Answer, FakeMatching, Run, refused, well
+from tests.cli.conftest import FakeMatching, Run, refused, well
 from tests.conftest import icosphere
 from tests.transfer.known import split
 from tests.transfer.skinned import write_skinned_glb
@@ -55,11 +53,6 @@ def call(words: str, map: str = "ab.npz", out: str = "") -> list[str]:
     noun, *more = words.split()
     given = [f"--{noun}", DATA[noun]] if noun in DATA and f"--{noun}" not in more else []
     return [f"transfer-{noun}", "a.ply", "b.ply", "-o", out or OUTPUT[noun], *given, "--map", map, *more]
-
-
-def record(answer: Answer) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(well(answer).out)
-    return found
 
 
 def test_a_vtp_keeps_its_arrays(run: Run, pair: Path) -> None:
@@ -102,7 +95,7 @@ def test_two_poses_of_a_mesh_are_told(run: Run, pair: Path) -> None:
 def test_values_of_a_finer_copy(run: Run, pair: Path) -> None:
     answer = run(*call("color --values values.npy --json", out="v.npy"))
     assert np.abs(np.load("v.npy") - load_shape("b.ply").verts).max() < 1e-6
-    found = record(answer)
+    found = answer.record
     assert found.pop("confidence_mean") > 0.99
     assert found.items() >= {
         ("columns", 3), ("output", "v.npy"), ("source", "a.ply"), ("target", "b.ply"), ("source_vertices", 162),
@@ -133,7 +126,7 @@ def test_directions_turn_with_the_surface(run: Run, pair: Path) -> None:
 
 @pytest.mark.parametrize("out", ["out.npy", "out.csv", "out.txt", "out.json"])
 def test_labels_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
-    found = record(run(*call("labels --json", out=out)))
+    found = run(*call("labels --json", out=out)).record
     assert (found["from"], found["to"], found["labels"]) == ("vertices", "vertices", 2)
     b = load_shape("b.ply")
     labels = load_labels(out, b)
@@ -146,12 +139,12 @@ def test_labels_of_faces(run: Run, pair: Path) -> None:
     names = np.where(a.verts[a.faces, 0].mean(axis=1) > 0, "right", "left")
     Path("faces.txt").write_text("\n".join(names) + "\n")
     answer = run(*call("labels --labels faces.txt --json", out="f.txt"))
-    assert record(answer)["to"] == "faces"
+    assert answer.record["to"] == "faces"
     assert Path("f.txt").read_text().split() == [*names] * 4
     assert f"2 different labels on the {4 * a.F} faces of b.ply" in answer.err
     well(run(*call("labels --labels faces.txt --to vertices", out="v.txt")))
     assert len(Path("v.txt").read_text().split()) == load_shape("b.ply").V
-    found = record(run(*call("labels --to faces --json", out="g.npy")))
+    found = run(*call("labels --to faces --json", out="g.npy")).record
     assert np.load("g.npy").shape == (4 * a.F,)
     assert (found["from"], found["to"]) == ("vertices", "faces")
 
@@ -164,7 +157,7 @@ def test_labels_of_equal_counts_are_asked_about(run: Run, pair: Path) -> None:
         np.save(name, np.arange(4))
     refused(run(*call("labels", map="same.npy")), "--on vertices", pair, {path.name for path in pair.iterdir()})
     for on in ("vertices", "faces"):
-        assert record(run(*call(f"labels --on {on} --json", map="same.npy")))["to"] == on
+        assert run(*call(f"labels --on {on} --json", map="same.npy")).record["to"] == on
         assert np.load("out.npy").tolist() == [0, 1, 2, 3]
 
 
@@ -173,7 +166,7 @@ def test_labels_of_faces_onto_a_cloud_go_to_its_points(run: Run, pair: Path) -> 
     save_shape("b.ply", Shape(a.verts, np.empty((0, 3), int)))
     np.save("same.npy", np.arange(a.V))
     np.save("labels.npy", (a.verts[a.faces, 2].mean(axis=1) > 0).astype(int))
-    assert record(run(*call("labels --json", map="same.npy")))["to"] == "vertices"
+    assert run(*call("labels --json", map="same.npy")).record["to"] == "vertices"
     clear = np.abs(a.verts[:, 2]) > 0.3
     assert np.array_equal(np.load("out.npy")[clear], (a.verts[clear, 2] > 0).astype(int))
     before = {path.name for path in pair.iterdir()}
@@ -182,7 +175,7 @@ def test_labels_of_faces_onto_a_cloud_go_to_its_points(run: Run, pair: Path) -> 
 
 @pytest.mark.parametrize("out", ["out.npz", "out.json"])
 def test_weights_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
-    found = record(run(*call("weights --json", out=out)))
+    found = run(*call("weights --json", out=out)).record
     assert (found["joints"], found["used_joints"], found["without_weights"]) == (2, 2, 0)
     b = load_shape("b.ply")
     weights = load_weights(out, b)
@@ -217,7 +210,7 @@ def test_the_skin_of_a_glb(run: Run, pair: Path) -> None:
 
 @pytest.mark.parametrize("out", ["out.csv", "out.json", "out.pp", "out.mrk.json", "out.tps"])
 def test_landmarks_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
-    assert record(run(*call("landmarks --json", out=out)))["landmarks"] == 2
+    assert run(*call("landmarks --json", out=out)).record["landmarks"] == 2
     b = load_shape("b.ply")
     found, furthest = load_landmarks(out, b)
     assert found.names == (("0", "1") if out == "out.tps" else ("nose", "chin"))
@@ -245,14 +238,14 @@ def test_values_in_doubt_are_kept_filled_or_blank(run: Run, pair: Path, doubtful
     answer = run(*call("color --values values.npy --blank nan --json", out="v.npy"))
     blank = np.isnan(np.load("v.npy")).all(axis=1)
     assert blank[doubtful].all() and not blank[load_shape("b.ply").verts[:, 0] < 0].any()
-    found = record(answer)
+    found = answer.record
     assert found["blank"] == found["low_confidence"] == blank.sum()
     assert found["low_confidence_share"] == pytest.approx(blank.mean())
     assert f"({blank.sum()} of 642)" in answer.err and "left blank" in answer.err
 
     answer = run(*call("color --values values.npy --fill --json", out="v.npy"))
     assert np.load("v.npy")[doubtful, 0].max() < 0.7  # nothing above the rim is known
-    found = record(answer)
+    found = answer.record
     assert found["filled"] == found["low_confidence"] > 0
     assert "filled in from their neighbours" in answer.err
 
@@ -274,7 +267,7 @@ def test_other_data_in_doubt(run: Run, pair: Path, doubtful: np.ndarray) -> None
 
 @pytest.mark.parametrize("noun", OUTPUT)
 def test_the_least_confidence_is_a_choice(run: Run, pair: Path, doubtful: np.ndarray, noun: str) -> None:
-    found = [record(run(*call(f"{noun} --min-confidence {least} --json"))) for least in ("0", "0.3", "1")]
+    found = [run(*call(f"{noun} --min-confidence {least} --json")).record for least in ("0", "0.3", "1")]
     assert [each["min_confidence"] for each in found] == [0, 0.3, 1]
     counts = [each["low_confidence"] for each in found]
     assert counts[0] == 0 and counts == sorted(counts)
@@ -364,7 +357,7 @@ def test_a_match_is_told_and_recorded(run: Run, pair: Path, noun: str, stub: Fak
     words = [word for word in call(f"{noun} --refine latent --seed 7 --json") if word not in ("--map", "ab.npz")]
     answer = run(*words)
     expected = {("map", None), ("model", "human"), ("refine", "latent"), ("seed", 7), ("seconds", 2.5)}
-    assert {(key, value) for key, value in record(answer).items() if key in dict(expected)} == expected
+    assert {(key, value) for key, value in answer.record.items() if key in dict(expected)} == expected
     assert "matched a.ply to b.ply (2.5 s)" in answer.err
     assert "a.ply: 3 faces dropped" in answer.err
 
@@ -382,6 +375,6 @@ def test_without_a_map_the_two_are_matched(run: Run, tmp_path: Path) -> None:
     assert found.shape == (b.V,)
     assert 0 <= found.min() and found.max() <= 1
     assert found[b.verts[:, 2].argmax()] > 0.9 and found[b.verts[:, 2].argmin()] < 0.15
-    said = record(answer)
+    said = answer.record
     assert said["confidence_mean"] > 0.5
     assert (said["model"], said["refine"]) == ("human", "none")

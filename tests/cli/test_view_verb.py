@@ -71,7 +71,7 @@ def test_a_map_of_any_format(show: Show, suffix: str) -> None:
 def test_json(show: Show) -> None:
     words, answer = show("a.ply b.ply --map map.npz --json --quiet")
     assert answer.err == ""
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["output"], record["map"]) == ("page.html", "map.npz")
     assert (record["source"], record["target"]) == ("a.ply", "b.ply")
     assert (record["verdict"], record["reasons"]) == ("fair", ["so so"])
@@ -85,7 +85,7 @@ def test_without_a_map_the_two_are_matched(show: Show, stub: FakeMatching) -> No
     config = FitConfig(refine="latent", seed=7, up="z", front="-y")
     assert (stub.called["config"], stub.called["threads"]) == ((config, config), 1)
     assert "3 faces dropped" in answer.err
-    record = json.loads(answer.out)
+    record = answer.record
     assert (record["refine"], record["seed"], record["seconds"]) == ("latent", 7, 2.5)
     # it stands as it was fitted
     extent = np.ptp(load_shape("b.ply").verts @ TURN.T, axis=0)

@@ -28,7 +28,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stub: FakeMatching) -
 
 def test_the_text_stays_and_the_distance_is_printed(run: Run, files: Path) -> None:
     answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--json", "--picture", "p.png"))
-    record = json.loads(answer.out)
+    record = answer.record
     assert set(record["vertices_to_surface"]) == {"mean", "95 %", "worst"}
     assert record["vertices_to_surface"]["95 %"] < 0.003
     assert (record["files"], record["free"], record["vertices"]) == (["out.obj"], 0, rod().V)
@@ -47,7 +47,7 @@ def test_faces_may_run_the_other_way(run: Run, files: Path) -> None:
     shape = rod()
     save_shape("base.obj", Shape(shape.verts, shape.faces[:, ::-1]))
     answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--json"))
-    assert json.loads(answer.out)["vertices_to_surface"]["95 %"] < 0.003
+    assert answer.record["vertices_to_surface"]["95 %"] < 0.003
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_faces_may_run_the_other_way(run: Run, files: Path) -> None:
 def test_free_vertices_by_number_or_part(run: Run, files: Path, name: str, text: str) -> None:
     Path(name).write_text(text)
     answer = well(run("wrap", "base.obj", "scan.ply", "-o", "out.obj", "--free", name, "--json"))
-    assert json.loads(answer.out)["free"] == 2
+    assert answer.record["free"] == 2
     assert "2 vertices kept their shape" in answer.err
 
 
