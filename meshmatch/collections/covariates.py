@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeAlias
+from unicodedata import normalize
 
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.collections.formula import Factor, Formula, term_name
+from meshmatch.collections.sources import find_name, name_index
 from meshmatch.errors import InputError, OptionError
 from meshmatch.shapes.tables import is_missing, is_number, parse_number, read_by_suffix, read_table
 
@@ -28,13 +29,17 @@ _NULLS = ("none", "null")  # missing values in a column of numbers, but a catego
 
 @dataclass(frozen=True, eq=False)
 class Covariates:
-    """The columns of a table as text, a cell for each shape in the order of ``names``; numbers have decimal points."""
+    """The columns of a table as text, a cell for each shape in the order of ``names``.
+
+    Numbers have decimal points, letters such as é are composed (NFC).
+    """
 
     names: tuple[str, ...]
     cells: dict[str, tuple[str, ...]]
 
     def column(self, name: str) -> tuple[str, ...]:
         """The cells of a column; `InputError` if there is no such column."""
+        name = normalize("NFC", name)
         if name not in self.cells:
             close = get_close_matches(name, self.cells, n=1)
             known = (
@@ -93,6 +98,7 @@ def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: 
         found = _reorder(
             {str(title): ["" if cell is None else str(cell) for cell in table[title]] for title in table}, names
         )
+    found = {normalize("NFC", title): tuple(normalize("NFC", cell) for cell in cells) for title, cells in found.items()}
     found.setdefault(SIZE, tuple(map(repr, sizes.tolist())))
     return Covariates(tuple(names), found)
 
@@ -132,10 +138,11 @@ def _reorder(cells: dict[str, list[str]], names: Sequence[str]) -> dict[str, tup
 def _match_rows(known: Sequence[str], names: Sequence[str], what: str) -> list[int]:
     """The row of each shape; a name in the table may have the suffix of a file. ``what`` names the table in messages."""
     rows: dict[str, int] = {}
-    wanted = set(names)
+    index = name_index(names)
     for k, word in enumerate(known):
-        name = word if word in wanted else os.path.splitext(word)[0]
-        if name in rows and name in wanted:
+        if (name := find_name(word, index)) is None:
+            continue
+        if name in rows:
             raise InputError(f"{what} has two rows for {name}", "keep one of them")
         rows[name] = k
     unmatched = [name for name in names if name not in rows]

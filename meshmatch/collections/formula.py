@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal, NoReturn, TypeAlias, get_args
+from unicodedata import normalize
 
 from meshmatch.errors import OptionError
 
@@ -68,7 +69,7 @@ class _Parser:
     """Recursive-descent parser of a formula: a sum of products of interactions of factors."""
 
     def __init__(self, text: str) -> None:
-        self._text = text.strip()
+        self._text = text = normalize("NFC", text.strip())
         self._tokens = [(quoted or also or word, mark) for quoted, also, word, mark in _TOKEN.findall(text)]
         self._position = 0
 

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import fnmatch
-import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +20,7 @@ from meshmatch.arrays import Float, Floats, Int, Ints, ShortRepr
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.covariates import shorten_names
 from meshmatch.collections.named_parts import WHOLE, Masks, groups_of, parts_of_file
+from meshmatch.collections.sources import find_name, name_index, spellings
 from meshmatch.collections.superimpose import Scale
 from meshmatch.errors import InputError, warn
 from meshmatch.shapes.files import PLAIN_SUFFIXES, load_shape
@@ -88,13 +88,13 @@ def match_names(names: Iterable[str], patterns: str | Sequence[str]) -> set[str]
 
     A pattern may also be the name of a file: a name with its suffix.
     """
-    known, found = list(names), set[str]()
+    index, found = name_index(names), set[str]()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        meant = fnmatch.filter(known, pattern) or fnmatch.filter(known, os.path.splitext(pattern)[0])
+        meant = next(filter(None, (fnmatch.filter(index, each) for each in spellings(pattern))), ())
         if not meant:
-            close = get_close_matches(pattern, known, n=1)
-            raise InputError(f"there is no shape called {pattern}", f"did you mean {(close or known)[0]}?")
-        found.update(meant)
+            close = get_close_matches(pattern, index, n=1)
+            raise InputError(f"there is no shape called {pattern}", f"did you mean {(close or list(index))[0]}?")
+        found.update(index[each] for each in meant)
     return found
 
 
@@ -160,6 +160,7 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
     """
     found = []
     known = set(shapes.names)
+    index = name_index([*shapes.names, *shapes.left_out])
 
     def read(path: Path) -> list[str]:
         return read_text(path, _LINE_BYTES).splitlines()
@@ -168,13 +169,13 @@ def read_group(path: str | Path, shapes: Registered) -> list[str]:
         word = line.strip()
         if not word:
             continue
-        meant = [name for name in (word, os.path.splitext(word)[0]) if name in known or name in shapes.left_out]
-        if not meant:
+        meant = find_name(word, index)
+        if meant is None:
             close = get_close_matches(word, shapes.names, n=1)
             hint = f"did you mean {close[0]}?" if close else _LIST_HINT
             raise InputError(f"{Path(path).name}: there is no shape called {word}", hint)
-        if meant[0] in known:
-            found.append(meant[0])
+        if meant in known:
+            found.append(meant)
     return found
 
 

@@ -6,8 +6,9 @@ import glob
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath
+from unicodedata import normalize
 
 from meshmatch import blender
 from meshmatch.collections.setting import FAILED, LEFT_OUT, Record, Source
@@ -75,6 +76,26 @@ def find_sources(
                 raise InputError(f"{same_name[0].path} is named {len(same_name)} times", "name each file once")
             raise InputError(f"two shapes are called {source.name}: {paths}", hint)
     return found, left_out
+
+
+def spellings(word: str) -> tuple[str, ...]:
+    """Spellings by which a list of shapes may name one, the likeliest first: as given, composed, without a file's suffix.
+
+    Programs compose letters such as é differently (Unicode NFC and NFD), and so do names of files.
+    """
+    stem = word[: len(word) - len(suffix_of(PurePath(word)))]
+    return word, normalize("NFC", word), stem, normalize("NFC", stem)
+
+
+def name_index(names: Iterable[str]) -> dict[str, str]:
+    """Names of shapes by themselves and by their composed spelling, see `spellings`."""
+    known = list(names)
+    return {normalize("NFC", name): name for name in known} | {name: name for name in known}
+
+
+def find_name(word: str, index: Mapping[str, str]) -> str | None:
+    """The name of the shape that a word means, in a `name_index`; None if there is none."""
+    return next((index[each] for each in spellings(word) if each in index), None)
 
 
 def frame_times(names: Iterable[str]) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 
@@ -95,6 +96,18 @@ def test_columns_of_python(tmp_path: Path) -> None:
     crossed = design_terms(parse("form ~ age*sex"), covariates({"age": range(7), "sex": "xxyyxyx"}, NAMES, SIZES))[0]
     assert crossed[2].coefficients == ("age:sex: y - x",)
     assert crossed[2].columns[:, 0].tolist() == [0, 0, 2, 3, 0, 5, 0]
+
+
+def test_names_and_categories_are_the_same_in_other_unicode(tmp_path: Path) -> None:
+    """Files of macOS decompose letters, keyboards and most tables do not."""
+    decomposed, composed = (unicodedata.normalize(form, "é") for form in ("NFD", "NFC"))
+    rows = [f"{composed}1,{composed}", f"{composed}2.ply,{decomposed}", "3.nii.gz,o", "4.seg.nrrd,o"]
+    names = [f"{decomposed}1", f"{decomposed}2", "3", "4.seg"]
+    known = covariates(write(tmp_path / "t.csv", f"name,t{decomposed}", *rows), names, np.ones(4))
+    assert known.names == tuple(names)
+    (term,), _ = design_terms(parse(f"form ~ t{decomposed}"), known)
+    assert term.coefficients == (f"t{composed}: {composed} - o",)
+    assert known.column(f"t{decomposed}") == (composed, composed, "o", "o")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,16 @@ def test_a_group_is_a_list_of_names(tmp_path: Path) -> None:
     assert "--metadata TABLE" in (refused.value.hint or "")
     with pytest.raises(InputError):
         read_group(tmp_path / "gone.txt", shapes)
+
+
+def test_names_of_files_have_the_suffix_of_the_format_and_any_unicode(tmp_path: Path) -> None:
+    decomposed, composed = (unicodedata.normalize(form, "é") for form in ("NFD", "NFC"))
+    names = (decomposed, "ct-1", "ct-2.seg")
+    assert match_names(names, [f"{composed}.ply", "ct-*.nii.gz"]) == set(names)
+    shapes = Registered(np.empty((3, 1, 3)), np.empty((0, 3), np.int64), names, None, {})
+    file = tmp_path / "group.txt"
+    file.write_text(f"ct-1.nii.gz\nct-2.seg.nrrd\n{composed}\n", encoding="utf-8")
+    assert read_group(file, shapes) == ["ct-1", "ct-2.seg", decomposed]
 
 
 def test_cut_shapes_among_whole_ones_are_told() -> None:
