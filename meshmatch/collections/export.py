@@ -273,6 +273,8 @@ class _Metadata:
         if units := mixed_units(self.names, self.sizes):
             warn(units)
         more = {} if table is None else {title: cells for title, cells in table.cells.items() if title not in own}
+        if table is not None and (lost := [title for title in table.cells if title in own]):
+            warn(f"metadata.csv has columns of its own called {', '.join(lost)}; those of the table are left out")
         if set(more.get(SIZE, ())) == {"nan"}:  # a placeholder that was filled in because the table has no sizes
             del more[SIZE]
         write_rows(path, [*own, *more], zip(*own.values(), *more.values(), strict=True))

@@ -226,7 +226,9 @@ def test_coordinates_are_exported_as_tables(fits: Path, run: Run, tmp_path: Path
     (tmp_path / "table.csv").write_text("shape;sex;verdict;age\ndancer.ply;f;yes;62,5\nclimber;m;no;30\n")
     for suffix in (".csv", ".npz"):
         words = ["export", fits, "-o", tmp_path / suffix, "--format", suffix, "--place", "template", "-q"]
-        assert run(*words, "--metadata", tmp_path / "table.csv").status == 0
+        answer = run(*words, "--metadata", tmp_path / "table.csv")
+        assert answer.status == 0
+        assert "columns of its own called verdict;" in answer.err
     with np.load(tmp_path / ".npz" / "coords.npz", allow_pickle=False) as found:
         points, faces, names = found["points"], found["faces"], found["names"].tolist()
         sizes, mirrored = found["centroid_size"].tolist(), found["mirrored"]
