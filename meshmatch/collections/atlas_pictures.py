@@ -20,7 +20,7 @@ from meshmatch.collections.permutation import PlaceTests
 from meshmatch.render.charts import Dots, draw_dots, draw_histogram, draw_panels, draw_scree
 from meshmatch.render.figures import Panel
 from meshmatch.render.picture import Look, draw_apart, render_shapes
-from meshmatch.render.scales import Scale, nice_step
+from meshmatch.render.scales import Scale, nice_step, readable
 from meshmatch.shapes.shape import Shape
 
 ChartFormat = Literal["png", "svg", "pdf"]
@@ -90,7 +90,7 @@ def draw_effects(folder: Path, mean: Shape, found: Explained, turn: Float[Floats
         if effect.places is not None
     ]
     for number, (name, along, places) in enumerate(shown[:_MAX_EFFECTS], 1):
-        slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:40]
+        slug = re.sub(r"[^a-z0-9]+", "-", readable(name).lower()).strip("-")[:40]
         draw_effect(folder / f"effect-{number}-{slug}.png", mean, name, along, places, turn)
 
 

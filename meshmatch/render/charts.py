@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unicodedata import category
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from meshmatch.arrays import Floats, UInts8
 from meshmatch.errors import OptionError
 from meshmatch.maps.evaluate import CM, Errors, ErrorUnit
 from meshmatch.outputs import replace_on_success
-from meshmatch.render.scales import short
+from meshmatch.render import scales
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -297,6 +299,20 @@ def _draw_marks(axes: Axes, marks: Mapping[float, str], places: Floats) -> None:
         side = "left" if share < 0.2 else "right" if share > 0.8 else "center"
         at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
         axes.annotate(short(name, 30), (place, 1), (0, 4), ha=side, color=_GREY, **at)
+
+
+def short(text: str, most: int = 60) -> str:
+    """The text on one line, as by `scales.short`, in the letters of the charts' font."""
+    return scales.short(text, most, _has_glyph)
+
+
+@lru_cache(maxsize=4096)
+def _has_glyph(letter: str) -> bool:
+    from matplotlib.font_manager import FontProperties, findfont, get_font
+
+    return (
+        not category(letter).startswith("C") and get_font(findfont(FontProperties())).get_char_index(ord(letter)) != 0
+    )
 
 
 @contextmanager

@@ -6,7 +6,7 @@ Text is set in the font that Pillow includes.
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -174,19 +174,23 @@ def text_width(text: str, size: float) -> float:
     return float(_font(size).getlength(text))
 
 
-def readable(text: str) -> str:
-    """The text on one line, in letters that the font has: Latin letters without accents if necessary, others as "?"."""
+def readable(text: str, has_glyph: Callable[[str], bool] | None = None) -> str:
+    """The text on one line, in letters that the font has: Latin letters without accents if necessary, others as "?".
+
+    ``has_glyph`` says whether the font has a letter; by default the font is that of pictures.
+    """
+    known = has_glyph or _has_glyph
     out = []
-    for letter in " ".join(text.split()):
-        plain = letter if _has_glyph(letter) else _PLAIN.get(letter) or unicodedata.normalize("NFKD", letter)
-        kept = "".join(part for part in plain if _has_glyph(part) and not unicodedata.combining(part))
+    for letter in unicodedata.normalize("NFC", " ".join(text.split())):
+        plain = letter if known(letter) else _PLAIN.get(letter) or unicodedata.normalize("NFKD", letter)
+        kept = "".join(part for part in plain if known(part) and not unicodedata.combining(part))
         out.append(kept or ("" if unicodedata.combining(letter) else "?"))
     return "".join(out)
 
 
-def short(text: str, most: int = 60) -> str:
+def short(text: str, most: int = 60, has_glyph: Callable[[str], bool] | None = None) -> str:
     """The text as by `readable`, cut in the middle if it is longer than ``most`` letters."""
-    text = readable(text)
+    text = readable(text, has_glyph)
     return text if len(text) <= most else f"{text[: most // 2]}…{text[-(most // 2 - 1) :]}"
 
 
