@@ -176,7 +176,7 @@ def design_terms(formula: Formula, known: Covariates) -> tuple[list[DesignTerm],
     if sum(width) + 1 >= len(known.names):
         raise InputError(
             f"{len(known.names)} shapes are too few for a model of {sum(width) + 1} coefficients",
-            "leave out terms; each category but the first has a coefficient",
+            _many_coefficients_hint(max(coded, key=lambda factor: len(coded[factor][1])), known),
         )
     terms = []
     for term in formula.terms:
@@ -187,6 +187,16 @@ def design_terms(formula: Formula, known: Covariates) -> tuple[list[DesignTerm],
             titles = tuple(f"{one}:{other}" for one in titles for other in others)
         terms.append(DesignTerm(term_name(term), columns, titles))
     return terms, interpretation
+
+
+def _many_coefficients_hint(factor: Factor, known: Covariates) -> str:
+    """What may reduce the number of coefficients, most of which are those of a factor."""
+    cells = known.column(factor.column)
+    words = [cell for cell in cells if not is_number(cell)]
+    if words and 2 * len(words) < len(cells) and not factor.function:
+        return f"{factor.column} counts as categories, because of {words[0][:40]!r}: write a number, or leave the cell empty"
+    count = f"; {factor.column} has {len(set(cells))}" if words or factor.function == "factor" else ""
+    return f"leave out terms; each category but the first has a coefficient{count}"
 
 
 def _code_factor(factor: Factor, known: Covariates) -> tuple[Floats, tuple[str, ...], str]:

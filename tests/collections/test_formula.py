@@ -137,6 +137,13 @@ def test_what_a_table_cannot_say(tmp_path: Path, rows: list[str], formula: str, 
         design_terms(model, known.select(complete_rows(model, None, known)[0]))
 
 
+def test_a_word_among_numbers_is_named_if_there_are_too_many_categories() -> None:
+    for cells, hint in ((["1", "2", "3", "ca. 4", "5", "6", "7"], "because of 'ca. 4'"), (NAMES, "x has 7")):
+        with pytest.raises(InputError, match="7 shapes are too few") as caught:
+            design_terms(parse("form ~ x"), covariates({"x": cells}, NAMES, SIZES))
+        assert hint in caught.value.hint
+
+
 def test_columns_of_another_length_are_refused() -> None:
     with pytest.raises(InputError, match="age has 2 values for 7 shapes"):
         covariates({"age": [1, 2]}, NAMES, SIZES)
