@@ -115,6 +115,7 @@ class TrainOptions(Options):
     stiffness: float = Option(
         1.0,
         min=1e-6,
+        max=1e6,
         help="How strongly jointly refined fits are kept at a common stretch of the template; stored on the card. 1 suits "
         "bodies; 0.05 suits shapes that differ more, such as organs.",
     )
@@ -131,6 +132,7 @@ class TrainOptions(Options):
     identities: int | None = Option(
         None,
         min=1,
+        max=1_000_000,
         help="Number of different people or animals among the generated shapes. Default: 4096 people for --kind human, "
         "else 1024.",
     )

@@ -166,6 +166,10 @@ def parse_json(name: str, data: bytes) -> Any:
         return json.loads(data.decode("utf-8-sig"))
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+    except ValueError as error:
+        if type(error) is ValueError:  # neither broken text nor JSON: Python's limit of the digits of an integer
+            raise ValueError("a number has too many digits") from error
+        raise
 
 
 def check_memory(name: str, size: int, need: int) -> None:

@@ -31,7 +31,7 @@ _COLOR_SUFFIXES = (".ply", ".glb", ".vrm", ".obj", ".off", ".vtp", ".vtk", ".npy
 check_values_suffix = partial(tables.check_suffix, suffixes=VALUE_SUFFIXES, what="values")
 check_color_suffix = partial(tables.check_suffix, suffixes=_COLOR_SUFFIXES, what="vertex colors")
 _MAX_ROUNDING = 1e-7  # relative; a larger difference of a 32-bit number, or any of a whole number, is worth a warning
-_HINT = "one row of numbers for each vertex of the source, in the order of its file: .npy, .csv or .vtp"
+_HINT = "one row of numbers for each of its vertices, in the order of its file: .npy, .csv or .vtp"
 # Names that properties of a ply already have.
 _RESERVED = {"x", "y", "z", "red", "green", "blue", "alpha", "r", "g", "b", "a"}
 

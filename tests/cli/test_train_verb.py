@@ -291,6 +291,8 @@ def test_of_several_processes_one_speaks(
         ("--name ../up", 1, "../up"),
         ("--preset best", 2, "best"),
         ("--steps 0", 2, "--steps"),
+        ("--identities 1000001", 2, "--identities"),
+        ("--stiffness inf", 2, "--stiffness"),
         ("--poses nowhere.npz", 1, "nowhere.npz"),
         ("--poses dance.bvh", 1, "dance.bvh"),
         ("--pose-share 1.5", 2, "--pose-share"),

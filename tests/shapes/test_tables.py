@@ -208,3 +208,10 @@ def test_lines_longer_than_a_cell_may_be(tmp_path: Path, mark: str) -> None:
     table = read_table(tmp_path / "a.csv")
     assert table.separator == mark
     assert table.rows() == [[title.strip('"') for title in titles], *rows]
+
+
+def test_numbers_with_too_many_digits(tmp_path: Path) -> None:
+    """Python's own message names a function that the user of a file cannot call."""
+    (tmp_path / "l.json").write_text(f'{{"nose": {"1" * 10_000}}}')
+    with pytest.raises(InputError, match=r"l\.json .*: a number has too many digits"):
+        load_landmarks(tmp_path / "l.json", SHAPE)
