@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -20,6 +19,7 @@ from meshmatch.fitting.search.frames import axis_vector
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
+from meshmatch.shapes.copies import counterparts
 from meshmatch.shapes.deformed_files import add_appearance, warn_about_lost
 from meshmatch.shapes.files import ShapeLike, as_gltf_scene, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, gltf_vrm
@@ -39,9 +39,8 @@ from meshmatch.transfer.weight_files import SkinWeights, load_weights
 
 Pose = Literal["rest", "source"]
 """Pose of a rigged target: as in its own file, or as the source's."""
-# Two meshes are copies of a figure if more than this share of their vertices maps to the same vertices of the source, and
-# they are farther apart than this, in units of a copy's diagonal. Searched among so many of the largest meshes. Set by hand.
-_COPY_SHARE, _COPY_DISTANCE, _MAX_MESHES = 0.8, 0.1, 64
+# Copies of a figure are at least this far from it, in units of its diagonal; set by hand.
+_COPY_DISTANCE = 0.1
 # A clip lies if the cosine between y and the file's up axis, as the clip moves it, is below this; names in a warning.
 _LYING_COSINE, _MAX_LISTED = 0.5, 5
 _MAX_ANISOTROPY = 1.05  # largest over smallest scale of a joint; set by hand
@@ -189,26 +188,23 @@ def _warn_of_lying_clips(a: Shape, rig: Rig, weights: SkinWeights, up: str, targ
         warn(f"{a.name} lies in its file, where {up} is up, and {target} will lie in {named}: export it with y up")
 
 
-def _refuse_copies(target: Shape, backward: VertexMap) -> None:
-    """Raise `InputError` if the scene contains copies of a figure: all would follow the skeleton in one of them.
+def _refuse_copies(target: Shape, forward: VertexMap) -> None:
+    """Raise `InputError` if the scene contains copies of the matched figure: all would follow the skeleton in one of them.
 
     Two meshes in one place, such as a body and an outline drawn around it, are no copies.
     """
-    ends = np.cumsum([count for _, count in target.meshes], dtype=np.int64).tolist()
-    if len(ends) < 2 or ends[-1] != target.V:
+    counts = [count for _, count in target.meshes]
+    if len(counts) < 2 or sum(counts) != target.V:
         return
-    blocks = [slice(*each) for each in pairwise([0, *ends])]
-    largest = sorted(blocks, key=lambda block: block.start - block.stop)[:_MAX_MESHES]
-    for one, other in combinations(largest, 2):
-        here, there = backward.index[one], backward.index[other]
-        if len(here) != len(there) or (here == there).mean() <= _COPY_SHARE or 4 * len(np.unique(here)) < len(here):
-            continue  # the last condition: a mesh that was left out maps to few vertices
-        own = target.verts[one]
-        if np.linalg.norm(own - target.verts[other], axis=1).mean() > _COPY_DISTANCE * np.linalg.norm(
-            np.ptp(own, axis=0)
-        ):
-            hint = "export it once; copies of what comes out move alike"
-            raise InputError(f"{target.name} draws one figure several times, which one skeleton cannot move", hint)
+    mesh = np.repeat(np.arange(len(counts)), counts)
+    original = counterparts(target, ~np.isin(mesh, mesh[forward.index]))
+    copied = original >= 0
+    if not copied.any():
+        return
+    figure, copy = target.verts[original[copied]], target.verts[copied]
+    if np.linalg.norm(figure - copy, axis=1).mean() > _COPY_DISTANCE * np.linalg.norm(np.ptp(figure, axis=0)):
+        hint = "export it once; copies of what comes out move alike"
+        raise InputError(f"{target.name} draws one figure several times, which one skeleton cannot move", hint)
 
 
 def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *, pose: Pose = "rest") -> RiggedResult:
@@ -276,7 +272,8 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
             f"{', '.join(kept_figures.values())} of {target_shape.name or 'the target'} {keeps} own skeleton, "
             "apart from what was matched"
         )
-    _refuse_copies(target_shape, maps.backward)
+    else:
+        _refuse_copies(target_shape, maps.forward)
     _warn_of_lying_clips(source_shape, rig, weights, maps.forward.source_up, target_shape.name or "the target")
     with thread_limit(1):
         points, share = maps.forward.points(target_shape), vertex_weights(source_shape, maps)

@@ -43,8 +43,17 @@ def same_order(source: Path, target: Path) -> VertexMap:
     return VertexMap.between(a, b, np.arange(a.V) % b.V, verdict="good")
 
 
-def rigged(source: Path, target: Path, **options: Any) -> tuple[Path, meshmatch.RiggedResult]:
-    result = meshmatch.transfer_rig(source, target, same_order(source, target), **options)
+def to_both_parts(source: Path, target: Path) -> VertexMap:
+    """Vertex i to vertex i of one of two meshes, in turn, so that neither is a copy of what was matched."""
+    a, b = load_shape(source), load_shape(target)
+    order = np.arange(a.V)
+    return VertexMap.between(a, b, order + order % 2 * a.V, verdict="good")
+
+
+def rigged(
+    source: Path, target: Path, match: VertexMap | None = None, **options: Any
+) -> tuple[Path, meshmatch.RiggedResult]:
+    result = meshmatch.transfer_rig(source, target, match or same_order(source, target), **options)
     out = target.with_name("rigged.glb")
     result.save(out)
     return out, result
@@ -252,7 +261,7 @@ def test_a_glb_stays_as_it_came(source: Path) -> None:
     target = source.with_name("target.glb")
     before = two_parts(target)
     shape = load_shape(target)
-    out, _ = rigged(source, target)
+    out, _ = rigged(source, target, to_both_parts(source, target))
     after = Document(out, out.read_bytes())
     assert after.json["asset"].pop("extras")["meshmatch"]["made_of"] == [shape.hash]
     for kind in ("materials", "textures", "images", "asset"):
@@ -295,7 +304,7 @@ def test_meshes_that_move_something_else(source: Path) -> None:
     write_document(target, document, *arrays)
     where = load_shape(target).verts
     with pytest.warns(MeshmatchWarning, match="clips of target.glb that moved a mesh as a whole no longer do"):
-        out, _ = rigged(source, target)
+        out, _ = rigged(source, target, to_both_parts(source, target))
     found = Document(out, out.read_bytes()).json
     assert found["scenes"][0]["nodes"] == [3, 0, 1, 2, 4]
     assert [each["target"]["node"] for each in found["animations"][0]["channels"]] == [0]
@@ -305,7 +314,7 @@ def test_meshes_that_move_something_else(source: Path) -> None:
     camera = {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}
     write_document(target, document | {"cameras": [camera]}, *arrays)
     with pytest.warns(MeshmatchWarning, match="as a whole"):
-        out, _ = rigged(source, target)
+        out, _ = rigged(source, target, to_both_parts(source, target))
     found = Document(out, out.read_bytes()).json
     assert found["scenes"][0]["nodes"][:4] == [3, 0, len(found["nodes"]) - 1, 2]
     assert found["nodes"][1] == {key: nodes[1][key] for key in ("name", "scale", "camera")}
@@ -316,7 +325,7 @@ def test_meshes_that_move_something_else(source: Path) -> None:
     write_document(target, document | {"cameras": [camera]}, *arrays)
     stood = camera_place(target)
     with pytest.warns(MeshmatchWarning, match="as a whole"):
-        out, _ = rigged(source, target)
+        out, _ = rigged(source, target, to_both_parts(source, target))
     np.testing.assert_allclose(camera_place(out), stood, atol=1e-9)
     np.testing.assert_allclose(load_shape(out).verts, where, atol=1e-5)
 
@@ -329,10 +338,10 @@ def test_a_gltf_becomes_a_glb_that_needs_no_other_file(source: Path) -> None:
     words["images"] = [{"uri": "four.png"}, {"uri": "four.png", "name": "again"}]
     target.write_text(json.dumps(words))
     with pytest.raises(InputError, match=r"needs the file four\.png"):
-        rigged(source, target)
+        rigged(source, target, to_both_parts(source, target))
     target.with_name("four.png").write_bytes(image)
     shape = load_shape(target)
-    out, _ = rigged(source, target)
+    out, _ = rigged(source, target, to_both_parts(source, target))
     target.with_name("four.png").unlink()
     found = Document(out, out.read_bytes())
     assert [found.view_bytes(entry["bufferView"]) for entry in found.json["images"]] == [image, image]
@@ -432,16 +441,26 @@ def test_a_clip_of_the_target_takes_in_that_of_its_name(source: Path) -> None:
     assert np.abs(posed_verts(out, "bend", 1.0) - expected).max() < 1e-4
 
 
-@pytest.mark.parametrize("alike", [False, True])
-def test_a_thing_apart_keeps_its_skeleton(source: Path, alike: bool) -> None:
-    """A flag with joints at a root of their own, which a clip moves; but joints of the same names copy a skeleton."""
+@pytest.mark.parametrize(
+    ("alike", "away"),
+    [
+        pytest.param(False, 0.0, id="a flag"),
+        pytest.param(True, 5.0, id="another character of the same pack"),
+        pytest.param(True, 0.0, id="clothes with a copy of the skeleton"),
+    ],
+)
+def test_a_thing_apart_keeps_its_skeleton(source: Path, alike: bool, away: float) -> None:
+    """Its joints belong to a root of their own, and a clip moves them; but joints of the same names in the same places do
+    not make another figure.
+    """
     target = source.with_name("target.glb")
     write_tube(target)
     before = Document(target, target.read_bytes()).json
     nodes, meshes = [*before["nodes"], {"name": "flag", "mesh": 1, "skin": 1}], [before["meshes"][0]] * 2
     names = ("root", "hip", "knee", "foot") if alike else ("root", "pole", "cloth", "end")
-    nodes += [{"name": names[0], "translation": [5, 0, 0], "children": [9, 10, 11]}]
-    nodes += [{"name": name} for name in names[1:]]
+    nodes += [{"name": names[0], "translation": [away, 0, 0], "children": [9, 10, 11]}]
+    nodes += [{"name": name, "translation": [0, y, 0]} for name, y in zip(names[1:], (0.0, 1.0, 1.9), strict=True)]
+    replaced = alike and not away
     skins = [before["skins"][0], {"joints": [8, 9, 10, 11]}]
     channels = [{"sampler": 0, "target": {"node": 9, "path": "rotation"}}]
     clips = [{"name": "wave", "samplers": before["animations"][0]["samplers"], "channels": channels}]
@@ -453,12 +472,12 @@ def test_a_thing_apart_keeps_its_skeleton(source: Path, alike: bool) -> None:
         out, result = rigged(source, target)
     found = Document(out, out.read_bytes())
     told = "flag of target.glb keeps its own skeleton, apart from what was matched"
-    assert [str(each.message) for each in said] == [told] * (not alike)
-    assert result.replaced == 4 + 4 * alike
-    assert [each["name"] for each in found.json["animations"]] == (["bend"] if alike else ["wave", "bend"])
+    assert [str(each.message) for each in said] == [told] * (not replaced)
+    assert result.replaced == 4 + 4 * replaced
+    assert [each["name"] for each in found.json["animations"]] == (["bend"] if replaced else ["wave", "bend"])
     flag = next(node for node in found.nodes if node["name"] == "flag")
     bones = [found.nodes[joint]["name"] for joint in found.json["skins"][flag["skin"]]["joints"]]
-    assert bones == [*(JOINTS if alike else names)]
+    assert bones == [*(JOINTS if replaced else names)]
     assert np.abs(load_shape(out).verts - stood).max() < 1e-5
     assert np.abs(posed_verts(out, "bend", 1.0)[: tube().V] - posed_verts(source, "bend", 1.0)).max() < 1e-4
 
@@ -621,25 +640,26 @@ def test_joints_without_a_vertex_are_named(source: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("again", "places"),
+    "others",
     [
-        pytest.param({"scale": [1.02, 1.02, 1.02]}, None, id="an outline, which toon shading draws around a mesh"),
-        pytest.param({"translation": [3.0, 0, 0]}, 4, id="props, which lie near few places of the source"),
+        pytest.param(
+            [{"mesh": 0, "scale": [1.02, 1.02, 1.02]}], id="an outline, which toon shading draws around a mesh"
+        ),
+        pytest.param([{"mesh": 1}, {"mesh": 1, "translation": [3.0, 0, 0]}], id="a prop that is drawn twice"),
     ],
 )
-def test_what_moves_with_a_target_is_no_copy_of_it(source: Path, again: dict[str, Any], places: int | None) -> None:
+def test_what_moves_with_a_target_is_no_copy_of_it(source: Path, others: list[dict[str, Any]]) -> None:
     target, shape = source.with_name("target.glb"), tube()
+    nodes = [{"mesh": 0}, *others]
     document = {
         "scene": 0,
-        "scenes": [{"nodes": [0, 1]}],
-        "nodes": [{"mesh": 0}, {"mesh": 0, **again}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": k}]} for k in (1, 2)],
     }
-    write_document(target, document, shape.verts.astype("f4"), shape.faces.ravel().astype("u2"))
-    a, b = load_shape(source), load_shape(target)
-    back = VertexMap.between(b, a, np.tile(np.arange(a.V) % (places or a.V), 2))
-    result = meshmatch.transfer_rig(source, target, meshmatch.MapPair(a, b, same_order(source, target), opposite=back))
-    assert set(result.rig.names) >= set(JOINTS)
+    faces = shape.faces.ravel().astype("u2")
+    write_document(target, document, shape.verts.astype("f4"), faces, faces[: len(faces) // 2])
+    assert set(rigged(source, target)[1].rig.names) >= set(JOINTS)
 
 
 def test_what_cannot_be_rigged_is_told(source: Path) -> None:
@@ -664,10 +684,7 @@ def test_what_cannot_be_rigged_is_told(source: Path) -> None:
     )
     with pytest.raises(InputError, match="draws copies of one mesh"):
         meshmatch.transfer_rig(source, copies)
-    two = load_shape(plain)
-    back = VertexMap.between(two, load_shape(source), np.arange(two.V) % tube().V)
-    pair = meshmatch.MapPair(load_shape(source), two, same_order(source, plain), opposite=back)
     with pytest.raises(InputError, match=r"plain\.glb draws one figure several times"):
-        meshmatch.transfer_rig(source, plain, pair)
+        rigged(source, plain)
     with pytest.raises(OptionError, match="not a format for rigs"):
         rigged(source, target)[1].save("out.obj")

@@ -18,6 +18,7 @@ from meshmatch.shapes.formats.gltf_prune import can_edit_nodes
 from meshmatch.shapes.formats.gltf_rig import Binding
 
 _LIGHT, _MAX_NAMES = "KHR_lights_punctual", 5
+_MAX_SHIFT = 0.1  # largest distance between joints of two copies of a skeleton, as a share of its extent; set by hand
 
 
 def find_rigid_groups(document: Document) -> list[tuple[Ints, Ints]]:
@@ -45,7 +46,7 @@ def find_separate_figures(document: Document, hit: Ints) -> dict[int, str]:
     """Find skinned nodes that draw a separate object next to the matched figure, such as a flag; returns their names.
 
     ``hit`` are the vertices that a map reaches. No vertex of such a node is hit, its joints belong to other roots of the
-    scene, and at most half of them share a name with joints of the matched figure.
+    scene, and at most half of them share their names and positions with joints of the matched figure.
     """
     root: dict[int, int] = {}
     for node in document.roots():
@@ -63,11 +64,22 @@ def find_separate_figures(document: Document, hit: Ints) -> dict[int, str]:
             matched_skins |= set() if skin is None else {skin}
             matched_roots.add(root[number])
     joints = [{int(joint) for joint in skin["joints"]} for skin in document.json.get("skins", [])]
-    names = {document.nodes[joint].get("name") for skin in matched_skins for joint in joints[skin]}
+    place_of = {joint: document.world[joint][:3, 3] for joint in set().union(*joints) if joint in document.world}
+    figure = {
+        document.nodes[joint].get("name"): place_of[joint]
+        for skin in matched_skins
+        for joint in joints[skin]
+        if joint in place_of
+    }
+    tolerance = _MAX_SHIFT * float(np.ptp(list(figure.values()), axis=0).max()) if figure else 0.0
     matched_roots |= {root.get(joint, joint) for skin in matched_skins for joint in joints[skin]}
 
+    def is_copied(joint: int) -> bool:
+        place, own = figure.get(document.nodes[joint].get("name")), place_of.get(joint)
+        return place is not None and own is not None and bool(np.abs(place - own).max() <= tolerance)
+
     def is_apart(own: set[int]) -> bool:
-        copied = sum(document.nodes[joint].get("name") in names for joint in own)
+        copied = sum(is_copied(joint) for joint in own)
         return matched_roots.isdisjoint(root.get(joint, joint) for joint in own) and 2 * copied <= len(own)
 
     apart = {skin for skin in set(skin_of.values()) if matched_skins and joints[skin] and is_apart(joints[skin])}
