@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -129,7 +130,9 @@ def _replacing(path: Path) -> Iterator[Path]:
     if final.exists() and not os.access(final, os.W_OK):
         raise OutputError(f"cannot write {path}: it is write-protected", "choose another name with -o")
     if not folder.is_dir():
-        raise OutputError(f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
+        raise OutputError(
+            f"cannot write {path}: there is no folder {folder}", f"make it first: mkdir -p {shlex.quote(str(folder))}"
+        )
     # A name has at most 255 bytes, and a character up to 4 of them.
     temporary = folder / f".{path.stem[:40]}.{os.urandom(4).hex()}{path.suffix}"
     try:
@@ -223,7 +226,9 @@ def check_new_folder(path: str | Path, replaces: Collection[str] = ()) -> Path:
     if path.is_dir() and path.samefile(Path.cwd()):
         raise OutputError(f"cannot make the folder {path}: it is the current folder", "give the name of a new one")
     if not folder.is_dir():
-        raise OutputError(f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {folder}")
+        raise OutputError(
+            f"cannot make {path}: there is no folder {folder}", f"make it first: mkdir -p {shlex.quote(str(folder))}"
+        )
     return path
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -75,6 +76,9 @@ def test_an_output_that_is_a_link_keeps_the_link(tmp_path: Path) -> None:
     (tmp_path / "c.txt").symlink_to("nowhere/new.txt")
     with pytest.raises(OutputError, match="there is no folder"), replace_on_success(tmp_path / "c.txt"):
         pass
+    with pytest.raises(OutputError) as raised, replace_on_success(tmp_path / "my out" / "a.txt"):
+        pass
+    assert shlex.split(raised.value.hint)[-1] == str(tmp_path / "my out")
     (tmp_path / "empty").mkdir()
     (tmp_path / "d").symlink_to("empty")
     with folder_on_success(tmp_path / "d") as folder:
