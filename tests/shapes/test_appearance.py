@@ -1,6 +1,7 @@
 """What files say about the look of their surfaces."""
 
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from meshmatch.shapes import appearance
 from meshmatch.shapes.appearance import Appearance, ImageReader
 from meshmatch.shapes.colors import BYTE_TO_LINEAR, linear_to_bytes, to_linear, to_srgb
 from meshmatch.shapes.files import load_shape, save_shape
-from meshmatch.shapes.formats.obj_appearance import second_index
+from meshmatch.shapes.formats.obj_appearance import companions, second_index
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
 from tests.shapes.painted import CORNERS, FACES, UV, encoded, quarters, write_gltf, write_square_obj
@@ -261,6 +262,17 @@ def test_vertex_colors_where_nothing_else_is(tmp_path: Path) -> None:
 
 
 # What can be wrong
+
+
+@pytest.mark.parametrize(
+    ("line", "missing"), [("square.mtl lost.mtl", "lost.mtl"), ("my lost.mtl", "my lost.mtl"), ("lost.txt", "lost.txt")]
+)
+def test_only_what_is_missing_of_a_list_of_mtl_files_is_named(tmp_path: Path, line: str, missing: str) -> None:
+    write_square_obj(tmp_path / "a.obj", line)
+    (tmp_path / "square.mtl").write_text("newmtl paint\n")
+    with pytest.raises(InputError, match=rf"in {re.escape(missing)}, which is not there"):
+        look(tmp_path / "a.obj")
+    assert companions(tmp_path / "a.obj", (tmp_path / "a.obj").read_bytes())[1] == [missing]
 
 
 def obj(folder: Path, *lines: str, vt: bool = True, corners: str = "") -> Path:

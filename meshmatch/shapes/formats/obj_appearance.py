@@ -247,11 +247,9 @@ def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
     missing: dict[str, None] = {}
     [libraries] = lines_starting_with(join_lines(data), b"mtllib")
     for name, _ in _words(*libraries):
-        file_with_spaces = find_companion(path.parent, name)
-        files = [file_with_spaces] if file_with_spaces is not None else _library_files(path.parent, _uncommented(name))
-        if None in files or not files:
-            missing[name] = None
-        found |= dict.fromkeys(file for file in files if file is not None)
+        files, missing_names = _library_files(path.parent, name)
+        missing |= dict.fromkeys(missing_names)
+        found |= dict.fromkeys(files)
     for library in list(found):
         text = join_lines(read_bytes(library, largest=_MAX_MTL_BYTES)).decode("utf-8", "surrogateescape")
         for rest in _MAP_LINE.findall(text):
@@ -342,25 +340,27 @@ def _libraries(path: Path, names: list[str], shape: Shape) -> dict[str, _Entry]:
     """Read all mtl files that are referred to; a missing one raises `InputError`, unless the shape has vertex colors."""
     entries: dict[str, _Entry] = {}
     for name in dict.fromkeys(names):
-        file_with_spaces = find_companion(path.parent, name)
-        for file in (
-            [file_with_spaces] if file_with_spaces is not None else _library_files(path.parent, _uncommented(name))
-        ):
-            if file is not None:
-                entries |= _parse(file)
-            elif shape.colors is None:
-                missing = f"{path.name} has its materials in {name[:200]}, which is not there"
-                raise InputError(missing, f"copy it to {path.parent}, or name the picture with --image")
+        files, missing_names = _library_files(path.parent, name)
+        for file in files:
+            entries |= _parse(file)
+        if missing_names and shape.colors is None:
+            missing = f"{path.name} has its materials in {missing_names[0][:200]}, which is not there"
+            raise InputError(missing, f"copy it to {path.parent}, or name the picture with --image")
     return entries
 
 
-def _library_files(folder: Path, names: str) -> list[Path | None]:
-    """Resolve an mtllib line that has one file name, perhaps with spaces, or several; None for a missing file."""
-    several = [find_companion(folder, word) for word in names.split(None, _MAX_LIBRARIES)[:_MAX_LIBRARIES]]
-    if len(several) > 1 and not all(file is not None and file.suffix.lower() == ".mtl" for file in several):
-        file_with_spaces = find_companion(folder, names)
-        return several if file_with_spaces is None else [file_with_spaces]
-    return several
+def _library_files(folder: Path, line: str) -> tuple[list[Path], list[str]]:
+    """Resolve an mtllib line that has one file name, perhaps with spaces, or several: files, and names of missing ones."""
+    names = _uncommented(line)
+    words = names.split(None, _MAX_LIBRARIES)[:_MAX_LIBRARIES]
+    if (file := find_companion(folder, line)) is not None or not words:
+        return [] if file is None else [file], []
+    found = {word: find_companion(folder, word) for word in words}
+    files = [file for file in found.values() if file is not None]
+    is_list = all(word.lower().endswith(".mtl") for word in words)
+    if not (is_list and len(files) == len(found)) and (file := find_companion(folder, names)) is not None:
+        return [file], []
+    return files, [word for word, file in found.items() if file is None] if is_list else [line]
 
 
 def _parse(file: Path) -> dict[str, _Entry]:
