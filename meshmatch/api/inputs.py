@@ -19,6 +19,7 @@ from meshmatch.shapes.alignment import in_single_precision
 from meshmatch.shapes.cloud import on_a_line
 from meshmatch.shapes.repair import Repaired, repair
 from meshmatch.shapes.shape import Shape
+from meshmatch.threads import MAX_THREADS
 
 if TYPE_CHECKING:
     from meshmatch.models.trained import TrainedModel
@@ -92,11 +93,13 @@ def repair_allowing_parts(shape: Shape) -> Repaired:
 
 
 def checked_threads(threads: int | None) -> int:
-    """Return the number of threads, `THREADS` for None; `OptionError` if it is below 1 or not an integer."""
+    """Return the number of threads, `THREADS` for None; `OptionError` unless it is an integer from 1 to 4096."""
     if threads is None:
         return THREADS
-    if not is_integer(threads, 1):
-        raise OptionError(f"threads must be 1 or more, not {threads!r}", "leave it out for the default")
+    if not is_integer(threads, 1) or threads > MAX_THREADS:
+        raise OptionError(
+            f"threads must be an integer from 1 to {MAX_THREADS}, not {threads!r}", "leave it out for the default"
+        )
     return int(threads)
 
 

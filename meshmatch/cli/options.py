@@ -22,6 +22,7 @@ from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.fitting.fit_config import Refine
 from meshmatch.models.registry import AUTO, implicit_folder
 from meshmatch.outputs import replace_on_success
+from meshmatch.threads import MAX_THREADS
 
 if TYPE_CHECKING:
     from meshmatch.arrays import Ints
@@ -33,7 +34,7 @@ Source = Annotated[Path, Argument(metavar="SOURCE", help="The shape to match.")]
 Target = Annotated[Path, Argument(metavar="TARGET", help="The shape it is matched to.")]
 Seed = Annotated[int, Option(min=0, help="Random seed. The same seed gives the same result.")]
 Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout.")]
-Threads = Annotated[int, Option(min=1, max=4096, help="Number of threads.")]
+Threads = Annotated[int, Option(min=1, max=MAX_THREADS, help="Number of threads.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print only warnings and errors.")]
 ErrorUnit = Annotated[
     Literal["auto", "cm", "file", "x100"],

@@ -41,7 +41,7 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise InputError("it is not a MAT-file of version 5 to 7", _HINT)
-    wanted, found, others = set(names), {}, []
+    wanted, found, others, unread = set(names), {}, list[str](), list[str]()
     left = min(LARGEST, len(data) + MEMORY_ALLOWANCE // 4)  # up to four copies of the data exist during reading
     try:
         for kind, body in _elements(data[_HEADER:], order):
@@ -55,10 +55,12 @@ def read_mat(data: bytes, names: Iterable[str]) -> dict[str, Value]:
             name, value = _parse_array(body, order) if kind == _MATRIX else ("", None)
             if name in wanted and value is not None:
                 found[name] = value
-            elif name not in wanted | {""}:
-                others.append(name)
+            elif name:
+                (unread if name in wanted else others).append(name)
     except (ValueError, StopIteration, zlib.error) as error:
         raise InputError(f"it is damaged: {error or 'something is missing in it'}", _HINT) from error
+    if not found and unread:
+        raise InputError(f"its {unread[0]} is of a class that is not read", "save numbers as a full array")
     if not found:
         listed = f"only {', '.join(others[:_MAX_NAMES])}" if others else "nothing usable"
         raise InputError(f"it has {listed}", _NAMES_HINT)

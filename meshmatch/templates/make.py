@@ -66,7 +66,9 @@ class NodeConfig:
         if self.strategy not in STRATEGIES:
             raise OptionError(f"unknown node strategy {self.strategy!r}", f"choose one of {', '.join(STRATEGIES)}")
         if not is_integer(self.K, 4):
-            raise OptionError(f"{self.K!r} nodes are too few", "moving least squares needs at least 4")
+            raise OptionError(
+                f"K must be an integer of 4 or more, not {self.K!r}", "moving least squares needs at least 4"
+            )
         if not 0 < self.radius < np.inf:
             raise OptionError(f"a node radius must be positive, not {self.radius:g}", "0.13 suits a body")
         if not 0 <= self.depth < np.inf:

@@ -8,13 +8,14 @@ from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 from meshmatch.errors import OptionError
+from meshmatch.threads import MAX_THREADS
 
 _MAX_VALUES: dict[str, float] = {
     "shapes": 4096,
     "scans_per_shape": 256,
     "points": 100_000,
     "workers": 256,
-    "threads": 4096,
+    "threads": MAX_THREADS,
     "bodies": 20_000,
     "correct_points": 100_000,
 }

@@ -82,7 +82,7 @@ class TrainConfig:
         check_seed(self.seed)
         if self.draw not in get_args(Draw):
             raise OptionError(f"batches are drawn on {', '.join(get_args(Draw))}, not {self.draw!r}")
-        if not (is_number(self.rate) and is_number(self.decay) and self.rate > 0 and 0 <= self.decay <= 1):
+        if not (is_number(self.rate) and is_number(self.decay) and 0 < self.rate < math.inf and 0 <= self.decay <= 1):
             raise OptionError("a training needs a positive rate and a decay in 0..1")
         if self.minutes is not None and not (is_number(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes must be positive, not {self.minutes!r}")

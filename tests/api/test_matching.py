@@ -163,8 +163,10 @@ def test_what_is_no_shape_is_refused_in_words(wrong: Any) -> None:
 def test_configs_and_threads_that_do_not_fit(matcher: Matcher, sphere: Shape) -> None:
     with pytest.raises(OptionError, match="2 shapes need one FitConfig, or 2 of them, not 3"):
         matcher.match(sphere, sphere, [meshmatch.FitConfig()] * 3)
-    with pytest.raises(OptionError, match="threads must be 1 or more"):
+    with pytest.raises(OptionError, match="threads must be an integer from 1 to 4096"):
         Matcher("human", threads=0)
+    with pytest.raises(OptionError, match="not 4097"):
+        Matcher("human", threads=4097)
 
 
 @pytest.mark.parametrize(

@@ -106,6 +106,9 @@ def test_variables_under_other_names_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"maps\.mat: it has only C, T$") as caught:
         load_map(path)
     assert "'index' if it counts vertices from 0, or 'matlab_index' if from 1" in caught.value.hint
-    path.write_bytes(written({"index": {"a": 1}}))
+    path.write_bytes(written({"index": {"a": 1}, "T": np.arange(1, 4)}))
+    with pytest.raises(InputError, match="its index is of a class that is not read"):
+        load_map(path)
+    path.write_bytes(written({}))
     with pytest.raises(InputError, match="nothing usable"):
         load_map(path)

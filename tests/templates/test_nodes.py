@@ -285,7 +285,8 @@ def test_nodes_in_a_plane_cannot_grow_into_space() -> None:
     ("values", "told"),
     [
         ({"strategy": "psychic"}, "unknown node strategy 'psychic'"),
-        ({"K": 3}, "3 nodes are too few"),
+        ({"K": 3}, "4 or more, not 3"),
+        ({"K": 4.5}, "an integer of 4 or more, not 4.5"),
         ({"radius": 0.0}, "must be positive, not 0"),
         ({"radius": -1.0}, "must be positive"),
         ({"radius": float("nan")}, "must be positive"),

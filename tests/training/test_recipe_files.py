@@ -145,7 +145,8 @@ def test_a_change_takes_the_numbers_of_arrays() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"threads": 10**9}, {"rate": "x"}, {"workers": "a"}, {"minutes": "a"}, {"loss": None}]
+    "settings",
+    [{"threads": 10**9}, {"rate": "x"}, {"rate": np.inf}, {"workers": "a"}, {"minutes": "a"}, {"loss": None}],
 )
 def test_settings_of_a_training_are_checked(settings: dict[str, Any]) -> None:
     with pytest.raises(OptionError):
