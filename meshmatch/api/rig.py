@@ -19,6 +19,7 @@ from meshmatch.fitting.search.frames import axis_vector
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.outputs import as_path, replace_on_success
 from meshmatch.shapes import tables
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.copies import counterparts
 from meshmatch.shapes.deformed_files import add_appearance, warn_about_lost
 from meshmatch.shapes.files import ShapeLike, as_gltf_scene, as_shape, load_shape
@@ -245,6 +246,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
         raise OptionError(f"invalid pose {pose!r}", f"choose one of {', '.join(get_args(Pose))}")
     source = as_path(source)
     source_shape = load_shape(source)
+    sqrt_area_frame(source_shape)  # refuses a skeleton that collapses its skin, from which no joint can be placed
     if source.suffix.lower() not in gltf.SUFFIXES:
         raise InputError(f"{source_shape.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
     data = read_bytes(source)

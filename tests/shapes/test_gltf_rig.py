@@ -71,6 +71,7 @@ WRONG: list[tuple[Damage, str]] = [
     (lambda document: document["animations"][0]["samplers"][0].update(interpolation="MAGIC"), "no sense"),
     (lambda document: document["animations"][0]["channels"][0].update(sampler=9), "no sense"),
     (lambda document: document["accessors"][6].update(count=10**9), "it needs"),
+    (lambda document: document["accessors"][5].update(bufferView=0), "times of animation 0 go back"),
     (lambda document: document.update(animations={"name": "bend"}), "no sense"),
 ]
 
@@ -82,6 +83,21 @@ def test_damage_is_told_in_a_line(tmp_path: Path, damage: Damage, words: str) ->
     with pytest.raises(InputError, match=words) as caught:
         read_rig(path, path.read_bytes())
     assert "\n" not in caught.value.message
+
+
+def test_a_single_bind_matrix_does_not_serve_all_joints(tmp_path: Path) -> None:
+    path = tmp_path / "tube.gltf"
+    changed(path, lambda document: document["accessors"][4].update(count=1))
+    with pytest.raises(InputError, match="skin 0 has fewer inverse bind matrices than joints"):
+        load_shape(path)
+
+
+def test_a_skeleton_that_collapses_its_skin_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "tube.gltf"
+    shape = write_tube(tmp_path / "target.glb")
+    changed(path, lambda document: document["nodes"][0].update(scale=[0, 0, 0]))
+    with pytest.raises(InputError, match=r"tube\.gltf has no surface area"):
+        transfer_rig(path, shape)
 
 
 TARGETS: list[Damage] = [

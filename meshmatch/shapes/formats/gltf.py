@@ -325,6 +325,8 @@ class Document:
             matrices = np.stack([self.world[joint] for joint in skin["joints"]])
             if "inverseBindMatrices" in skin:
                 inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+                if len(inverse) < len(matrices):  # a single one would be broadcast
+                    raise ValueError(f"skin {number} has fewer inverse bind matrices than joints")
                 matrices = matrices @ inverse[: len(matrices)]
             self._skinning_matrices[number] = matrices
         return self._skinning_matrices[number]

@@ -211,6 +211,8 @@ def _clips(document: Document, index_of: dict[int, int]) -> tuple[Clip, ...]:
                 values = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-30)
             if not (np.abs(values) < _MAX_VALUE).all() or not (np.abs(times) < _MAX_VALUE).all():
                 raise ValueError(f"animation {number} holds what is not a number")
+            if (np.diff(times) < 0).any():
+                raise ValueError(f"the times of animation {number} go back")
             keys += n_keys
             if keys > _BASE_KEYS + document.size // 4:
                 message = f"the clips of {document.name} have over {_BASE_KEYS:,} keys, many of them shared"
