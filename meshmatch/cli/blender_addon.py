@@ -20,7 +20,7 @@ def blender_addon(
     panel is in the sidebar of the 3D view.
     """
     if output.suffix.lower() != ".zip":
-        raise OptionError(f"{output.name}: an extension for Blender is a zip", "end the name in .zip")
+        raise OptionError(f"{output.name or output}: an extension for Blender is a zip", "end the name in .zip")
     with replace_on_success(output) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted((SCRIPTS / "addon").glob("*.*")):
             text = file.read_text(encoding="utf-8").replace('version = "VERSION"', f'version = "{__version__}"')

@@ -122,7 +122,9 @@ def measure(
         why = "the confidence is too low there, or the map is discontinuous along a girth"
         console.warn(f"{transfer.names[1]}: {lost} of {len(found.names)} measurements are missing: {why}")
     text = "in the unit of its file; angles in degrees" if "angle" in found.kinds else "in the unit of its file"
-    console.say(f"wrote {output}: {len(found.names) - lost} measurements of {transfer.names[1]}, {text}")
+    count = len(found.names) - lost
+    what = "measurement" if count == 1 else "measurements"
+    console.say(f"wrote {output}: {count} {what} of {transfer.names[1]}, {text}")
     if picture is not None:
         from meshmatch.render.compose import compose_lines
 

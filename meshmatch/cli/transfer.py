@@ -275,7 +275,8 @@ def transfer_landmarks(
         more = f" and {len(low) - 10} more" if len(low) > 10 else ""
         listed = f"{', '.join(first_ones)}{more}"
         console.warn(f"{transfer.names[1]}: missing are landmarks of confidence below {min_confidence:g}: {listed}")
-    console.say(f"wrote {output}: {len(found.names) - len(low)} landmarks on {transfer.names[1]}")
+    count = len(found.names) - len(low)
+    console.say(f"wrote {output}: {count} landmark{'s' if count != 1 else ''} on {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_points
 

@@ -59,7 +59,7 @@ def transfer_rig(
         what = "clip of that skeleton no longer moves" if count == 1 else "clips of that skeleton no longer move"
         console.warn(f"{count} {what} anything: {names}")
     played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
-    console.say(f"wrote {output}: {transfer.names[1]} with {joints} joints{played}")
+    console.say(f"wrote {output}: {transfer.names[1]} with {joints} joint{'s' if joints != 1 else ''}{played}")
     if picture is not None:
         from meshmatch.render.compose import compose_labels
         from meshmatch.transfer.attributes import most_votes

@@ -49,6 +49,12 @@ def test_others_by_its_landmarks_with_their_lines(run: Run, copies: Shape) -> No
     assert np.linalg.norm(np.diff(reach["line"], axis=0)) == pytest.approx(reach["value"])
 
 
+def test_a_single_measurement_is_in_the_singular(run: Run, copies: Shape) -> None:
+    Path("own.csv").write_text("name,kind,a,b\nreach,distance,left fingertip,right fingertip\n")
+    answer = well(run("measure", "body", "in/small.ply", "-o", "out.csv", "--measurements", "own.csv"))
+    assert "wrote out.csv: 1 measurement of small.ply" in answer.err
+
+
 def test_all_are_one_table_whose_units_are_told(run: Run, copies: Shape) -> None:
     Path("own.csv").write_text(f"{OWN}none,distance,crown,crown\n")
     words = ("measure", "body", "in", "-o", "out", "--measurements", "own.csv", "--table", "all.csv")

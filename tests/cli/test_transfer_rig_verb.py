@@ -57,6 +57,11 @@ def test_a_vrm_is_read_and_a_rigged_target_said(run: Run, pair: Path) -> None:
     assert "warning: 1 clip of that skeleton no longer moves anything: bend\n" in answer.err
 
 
+def test_a_single_joint_is_in_the_singular(run: Run, pair: Path) -> None:
+    write_tube(Path("a.glb"), skins=[{"joints": [1, 1, 1, 1], "inverseBindMatrices": 4}], clips=False)
+    assert "wrote rigged.glb: b.ply with 1 joint\n" in well(run(*CALL)).err
+
+
 def test_joints_without_a_vertex_are_named(run: Run, pair: Path) -> None:
     """The target is the lower part of the source."""
     shape = tube()

@@ -290,7 +290,8 @@ def test_unsure_landmarks_are_named(run: Run, pair: Path, doubtful: np.ndarray) 
 
 def test_landmarks_off_the_surface_are_mentioned(run: Run, pair: Path) -> None:
     Path("marks.csv").write_text("name,x,y,z\nnose,1.3,0,0\n")
-    assert "warning: a landmark lies 0.3" in well(run(*call("landmarks"))).err
+    said = well(run(*call("landmarks"))).err
+    assert "warning: a landmark lies 0.3" in said and "wrote out.csv: 1 landmark on b.ply\n" in said
 
 
 # What cannot be
