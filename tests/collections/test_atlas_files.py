@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from meshmatch.collections import atlas_pictures
 from meshmatch.collections.atlas import Atlas
 from meshmatch.collections.atlas_files import AtlasResults, atlas_record, write_folder
 from meshmatch.collections.atlas_pictures import draw_effect, draw_scores
@@ -19,7 +21,7 @@ from meshmatch.collections.permutation import PlaceTests
 from meshmatch.shapes.files import load_shape
 from meshmatch.shapes.shape import Shape
 from tests.collections.ellipsoids import AXES, ellipsoids
-from tests.conftest import vtp_arrays
+from tests.conftest import icosphere, vtp_arrays
 
 
 @pytest.fixture(autouse=True)
@@ -112,6 +114,15 @@ def test_every_file_says_what_the_atlas_knows(tmp_path: Path, atlas: Atlas) -> N
     for name in [*pictures, "effect-1-log-size"]:
         with Image.open(tmp_path / f"{name}.png") as image:
             assert np.asarray(image.convert("L")).std() > 5, name
+
+
+def test_pictures_of_effects_have_names_in_plain_letters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    effect = SimpleNamespace(coefficients=("Gruppe: ödem",), along_normal=(np.zeros(3),), places=object())
+    drawn: list[str] = []
+    monkeypatch.setattr(atlas_pictures, "draw_effect", lambda path, *_: drawn.append(path.name))
+    found: Any = SimpleNamespace(table=SimpleNamespace(effects=[effect]))
+    atlas_pictures.draw_effects(tmp_path, icosphere(0), found, np.eye(3))
+    assert drawn == ["effect-1-gruppe-odem.png"]
 
 
 @pytest.mark.parametrize("kind", ["svg", "pdf"])

@@ -122,6 +122,8 @@ def test_names_of_files_have_the_suffix_of_the_format_and_any_unicode(tmp_path: 
     decomposed, composed = (unicodedata.normalize(form, "é") for form in ("NFD", "NFC"))
     names = (decomposed, "ct-1", "ct-2.seg")
     assert match_names(names, [f"{composed}.ply", "ct-*.nii.gz"]) == set(names)
+    for word in (f"{decomposed}.1", f"{decomposed}.1.ply"):
+        assert match_names([f"{composed}.1"], word) == {f"{composed}.1"}
     shapes = Registered(np.empty((3, 1, 3)), np.empty((0, 3), np.int64), names, None, {})
     file = tmp_path / "group.txt"
     file.write_text(f"ct-1.nii.gz\nct-2.seg.nrrd\n{composed}\n", encoding="utf-8")

@@ -49,6 +49,14 @@ def test_letters_of_other_languages_are_kept(tmp_path: Path) -> None:
     assert charts[0] == charts[1] != charts[2]
 
 
+def test_marks_that_turn_text_around_are_not_drawn(tmp_path: Path) -> None:
+    charts = []
+    for number, label in enumerate(("a\u202eb", "a?b")):
+        draw_lines(LINE, tmp_path / f"{number}.svg", label, "cm", {})
+        charts.append((tmp_path / f"{number}.svg").read_bytes())
+    assert charts[0] == charts[1]
+
+
 def test_a_curve_rises_where_the_errors_are(tmp_path: Path) -> None:
     errors = {"good": Errors(np.full(50, 0.01)), "bad": Errors(np.full(50, 0.05))}
     draw_curves(errors, tmp_path / "cm.png", 10.0, unit=X100)

@@ -275,6 +275,12 @@ def test_only_what_is_missing_of_a_list_of_mtl_files_is_named(tmp_path: Path, li
     assert companions(tmp_path / "a.obj", (tmp_path / "a.obj").read_bytes())[1] == [missing]
 
 
+def test_a_name_with_spaces_may_have_a_comment_behind_it(tmp_path: Path) -> None:
+    write_square_obj(tmp_path / "a.obj", "my square.mtl # of the body")
+    (tmp_path / "my square.mtl").write_text("newmtl paint\nKd 1 0 0\n")
+    assert companions(tmp_path / "a.obj", (tmp_path / "a.obj").read_bytes()) == ([tmp_path / "my square.mtl"], [])
+
+
 def obj(folder: Path, *lines: str, vt: bool = True, corners: str = "") -> Path:
     """A square whose mtl has some lines; with none, it names no mtl."""
     write_square_obj(folder / "a.obj", "square.mtl" if lines else None, vt)
