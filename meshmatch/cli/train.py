@@ -429,21 +429,20 @@ def _generated(how: TrainOptions) -> "Kind | Bodies | None":
     from meshmatch.generators.kinds import Kind
     from meshmatch.generators.pose_files import load_poses
 
+    if how.kind not in (None, "human"):
+        human = ("template", "poses", "characters", "stylised", "bodies", "mhr")
+        how.refuse(human, f"--kind {how.kind}, but with human bodies")
+        return Kind(str(how.kind), how.identities or Kind.identities)
     known = None if how.poses is None else load_poses(how.poses, how.pose_share)
     scanned = None
     if how.mhr is not None:
         from meshmatch.api.scanned import scanned_bodies
 
         scanned = scanned_bodies(how.mhr, how.mhr_share, how.template)
-    if how.kind in (None, "human"):
-        choices = how.kind, known, how.characters, how.bodies, scanned, how.stylised
-        if how.shapes is not None and all(each is None for each in choices):
-            return None
-        return Bodies(how.template, how.identities or Bodies.identities, *choices[1:])
-    how.refuse(
-        ("template", "poses", "characters", "stylised", "bodies", "mhr"), f"--kind {how.kind}, but with human bodies"
-    )
-    return Kind(str(how.kind), how.identities or Kind.identities)
+    choices = how.kind, known, how.characters, how.bodies, scanned, how.stylised
+    if how.shapes is not None and all(each is None for each in choices):
+        return None
+    return Bodies(how.template, how.identities or Bodies.identities, *choices[1:])
 
 
 def _draw(console: Console, picture: Path, reports: "list[StepReport]") -> None:
