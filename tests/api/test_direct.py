@@ -22,6 +22,7 @@ from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.maps.deformed import deformed
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from tests.fitting.small_viscous import SmallViscous
 from tests.fitting.test_direct import QUICK, bent, creature
 
 
@@ -38,11 +39,18 @@ def found(shapes: tuple[Shape, Shape]) -> Any:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch, found: Any) -> None:
-    monkeypatch.setattr(direct, "match_directly", lambda *_: found)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits of shapes that stand alike are of few nodes."""
+    monkeypatch.setattr(same_pose, "ViscousConfig", SmallViscous)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, found: Any, small: None) -> None:
+    """What a search would find is known."""
+    monkeypatch.setattr(direct, "match_either_side", lambda *_, **__: found)
+
+
+@pytest.mark.usefixtures("small")
 def test_a_pair_is_matched_both_ways_without_a_model(shapes: tuple[Shape, Shape]) -> None:
     result = meshmatch.match(*shapes, model="none")
     for way, target in ((result.map, shapes[1]), (result.backward(), shapes[0])):
@@ -116,6 +124,7 @@ def test_a_mirror_image_is_taken_unless_it_is_not_wanted(
         assert ("target: taken for a mirror image of source" in result.notes) == said
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_cannot_be_matched_directly_keeps_the_map_of_its_model(
     shapes: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,6 +26,7 @@ from meshmatch.shapes.shape import Shape
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 CONFIG = FitConfig()
+QUICK = FitConfig.quick(again=False, samples=2000)
 
 
 def ball(name: str, *, opened: bool = False) -> Shape:
@@ -62,7 +63,7 @@ def poor_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def choose(*shapes: Shape, settled: TrainedModel | None = None) -> tuple[str, list[str]]:
-    choice = kinds.choose_model([repair_or_raise(shape) for shape in shapes], [CONFIG] * len(shapes), settled)
+    choice = kinds.choose_model([repair_or_raise(shape) for shape in shapes], [QUICK] * len(shapes), settled)
     return choice.model.card.name, choice.notes
 
 
@@ -172,10 +173,10 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
     dancer = load_shape(SAMPLES / "dancer.ply")
     strange = Shape(dancer.verts, dancer.faces, "robot 5.5 5.6 7")
     assert choose(strange) == ("human", ["robot 5.5 5.6 7: human"])
-    unrefined = kinds.choose_model([repair_or_raise(strange)], [FitConfig(refine="none")])
+    unrefined = kinds.choose_model([repair_or_raise(strange)], [replace(QUICK, refine="none")])
     assert (unrefined.model.card.name, unrefined.fits) == ("human", [None])  # a refined fit is not what was asked for
     monkeypatch.setattr(matcher, "Fitter", None)  # what told the kind is not fitted again
-    fit = Matcher().fit(strange)
+    fit = Matcher(config=QUICK).fit(strange)
     assert fit.verdict == "good" and fit.repaired is not None
     for words in ("robot 7 7.1 7.2", "robot 7 7.1 5.5"):  # too strange; and no animal
         with pytest.raises(InputError, match="does not look like"):

@@ -25,7 +25,6 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
 from meshmatch.fitting.solve.agreement import agree_step
 from meshmatch.fitting.solve.system import node_system
-from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.locks import locked
 from meshmatch.maps.fit_files import read_fit, read_fit_header, write_fit
 from meshmatch.shapes.files import load_shape, save_shape
@@ -33,6 +32,7 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.location import bundled_folder
 from meshmatch.templates.template import load_template
 from tests.conftest import icosphere
+from tests.fitting.small_viscous import SmallViscous, use_small_fits
 
 SAMPLES = Path(__file__).parents[2] / "templates" / "samples"
 NAMES = ["climber", "dancer", "turned"]
@@ -415,7 +415,7 @@ def test_a_sequence_is_followed_and_a_lost_frame_found_again(tmp_path: Path, mon
     folder = tmp_path / "frames"
     folder.mkdir()
     step = 0.02 * dancer.diagonal
-    for number in range(7, 13):
+    for number in range(8, 12):
         verts = dancer.verts + number * step * np.array([0, 0, 1.0])
         save_shape(folder / f"frame{number}.ply", Shape(verts, dancer.faces))
     other = np.sqrt(dancer.area / climber.area) * climber.verts * [1, -1, -1]
@@ -430,21 +430,22 @@ def test_a_sequence_is_followed_and_a_lost_frame_found_again(tmp_path: Path, mon
 
     monkeypatch.setattr(Fitter, "fit", counted)
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
-    few = meshmatch.FitConfig(variants=4, finalists=2)
+    few = meshmatch.FitConfig(variants=4, finalists=2, samples=3000)
     tell = lambda record: order.append(record.name)  # noqa: E731
     made = collection.fit(folder, model="human", config=few, sequence=True, agree=False, tell=tell)
-    assert order == [f"frame{number}" for number in range(7, 13)]
+    assert order == [f"frame{number}" for number in range(8, 12)]
     assert {record.verdict for record in made.records} == {"good"}
     assert (collection.map("frame8", "frame10").index == np.arange(dancer.V)).mean() > 0.5
-    assert anew == ["frame7", "frame9", "frame10"]
+    assert anew == ["frame8", "frame9", "frame10"]
     ups = {record.name: record.up for record in made.records}
     assert [ups[f"frame{number}"] for number in (8, 9, 10)] == ["+y", "-z", "+y"]
-    places = [collection.fit_of(f"frame{number}").points_in_file.mean(0)[2] for number in (10, 11, 12)]
+    places = [collection.fit_of(f"frame{number}").points_in_file.mean(0)[2] for number in (10, 11)]
     assert np.allclose(np.diff(places), step, rtol=0.1)
 
 
-def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
+def test_without_a_model_the_shapes_make_their_template(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Eggs of four shapes, meshed apart and tipped a little: their poles are found, and nothing is called good."""
+    use_small_fits(monkeypatch)
     folder = tmp_path / "eggs"
     folder.mkdir()
     eggs = {}
@@ -467,22 +468,23 @@ def test_without_a_model_the_shapes_make_their_template(tmp_path: Path) -> None:
     assert collection.template.hash == template
     means = {load_template(tmp_path / "fits" / name).hash for name in ("first.safetensors", "second.safetensors")}
     assert len(means | {template}) == 3  # the mean of the first fits, and of those that it has
-    assert collection.template.K == ViscousConfig().finest().nodes > ViscousConfig.nodes
+    assert collection.template.K == SmallViscous().finest().nodes > SmallViscous.nodes
     with pytest.raises(OptionError, match="another model"):
         collection.fit(folder, model="human")
     frames = meshmatch.Collection(tmp_path / "frames", workers=1)
     frames.fit(folder, model="none", sequence=True)
-    assert frames.template.K < ViscousConfig().finest().nodes
+    assert frames.template.K < SmallViscous().finest().nodes
 
 
-def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path) -> None:
+def test_where_no_fit_is_to_be_trusted_maps_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Triangles that are too large for a close fit: the first template remains that of all."""
-    write_eggs(tmp_path / "eggs", 3, splits=1)
+    use_small_fits(monkeypatch)
+    write_eggs(tmp_path / "eggs", 2, splits=1)
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
     made = collection.fit(tmp_path / "eggs", model="none")
     assert {record.verdict for record in made.records} == {"poor"}
-    assert collection.map("egg0", "egg2").verdict == "poor"
-    assert collection.save_maps(tmp_path / "maps") == 6
+    assert collection.map("egg0", "egg1").verdict == "poor"
+    assert collection.save_maps(tmp_path / "maps") == 2
 
 
 def test_a_collection_has_the_shapes_of_before_as_long_as_their_files_are_there(shapes: Path, tmp_path: Path) -> None:
@@ -591,7 +593,8 @@ def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path)
         shutil.copy(SAMPLES / f"{name}.ply", tmp_path / "shapes" / f"{'a-' if name == 'dancer' else ''}{name}.ply")
     collection = meshmatch.Collection(tmp_path / "fits", workers=1)
     told: list[Record] = []
-    made = collection.fit(tmp_path / "shapes", tell=told.append)
+    few = meshmatch.FitConfig.quick(again=False, samples=2000, copies=8)
+    made = collection.fit(tmp_path / "shapes", config=few, tell=told.append)
     assert sorted((record.name, record.verdict) for record in told) == [
         ("a-dancer", "good"), ("calf", "good"), ("fox", "good")
     ]  # fmt: skip
@@ -606,7 +609,7 @@ def test_each_shape_of_a_mixed_folder_gets_the_model_of_its_kind(tmp_path: Path)
     files = [tmp_path / "shapes" / f"{name}.ply" for name in ("calf", "fox")]
     assert collection.maps_between(*files).forward.verdict == "good"
     before = {path: path.read_bytes() for path in (tmp_path / "fits").rglob("*.safetensors")}
-    assert [record.verdict for record in collection.fit(tmp_path / "shapes").records] == ["good"] * 3
+    assert [record.verdict for record in collection.fit(tmp_path / "shapes", config=few).records] == ["good"] * 3
     assert before == {path: path.read_bytes() for path in (tmp_path / "fits").rglob("*.safetensors")}
 
 

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from meshmatch.cli import main
-from meshmatch.collections import select_setting
 from meshmatch.experiments.makers import bones
-from meshmatch.fitting import without_model
-from meshmatch.fitting.fit_config import Schedule
-from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.maps.files import load_map
 from meshmatch.models.card import read_card
 from meshmatch.shapes.decimate import decimate
@@ -38,6 +33,7 @@ from meshmatch.shapes.formats.gltf_rig import Binding, Clip, Rig, Track
 from meshmatch.shapes.landmark_files import read_landmark_file
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance
+from tests.fitting.small_viscous import use_small_fits
 from tests.shapes.painted import quarters
 from tests.transfer.rigs import posed_verts
 
@@ -133,22 +129,9 @@ def test_two_files_become_a_walking_textured_dressed_character(tmp_path: Path, m
     assert Path("character.png").stat().st_size > 1000
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Small(ViscousConfig):
-    nodes: int = 150
-    radius: float = 0.18
-    faces: int = 1200
-    samples: int = 1500
-    back_points: int = 800
-    schedule: Schedule = field(default=Schedule(steps=10, prior=(1e-3, 1e-6), scale=(0.1, 0.02), damping=1e-6))
-
-
 @pytest.fixture
 def small_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits without a model on few nodes, of few samples: enough for small bones."""
-    for module in (select_setting, without_model):
-        monkeypatch.setattr(module, "ViscousConfig", _Small)
-    monkeypatch.setattr(without_model, "_ALIGN_SAMPLES", 300)
+    use_small_fits(monkeypatch)
 
 
 def check_by_r(folder: Path) -> None:
@@ -227,17 +210,40 @@ def test_the_code_of_a_page_runs(
     exec(compile(script(page, "python"), f"{page}.md", "exec"), {"__name__": "__main__"})
 
 
-@pytest.mark.skipif(not dist.is_gloo_available(), reason="this torch has no gloo")
+FORKED = """
+import os, runpy, shlex, socket, sys
+import torch._dynamo, torch.distributed.run
+import meshmatch.training.train  # which all processes then have
+for line in sys.stdin:
+    chosen = torch.distributed.run.get_args_parser().parse_args(shlex.split(line)[1:])
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    count, processes = int(chosen.nproc_per_node), []
+    for rank in range(count):
+        processes.append(os.fork())
+        if not processes[-1]:
+            os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(count)}
+            os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+            sys.argv = [chosen.training_script, *chosen.training_script_args]
+            runpy.run_path(sys.argv[0], run_name="__main__")
+            os._exit(0)
+    assert [os.waitpid(each, 0)[1] for each in processes] == [0] * count
+"""
+"""As torchrun, for lines of it, but each process does not import torch again."""
+
+
+@pytest.mark.skipif(not dist.is_gloo_available() or not hasattr(os, "fork"), reason="this torch has no gloo")
 def test_the_training_by_two_processes_goes_on_exactly(tmp_path: Path) -> None:
     (tmp_path / "two.py").write_text(script("training", 'python title="two.py"'), encoding="utf-8")
-    cards = []
-    for line in script("training", 'bash title="terminal"').splitlines():
-        program, *words = shlex.split(line)
-        assert program == "torchrun"
-        run([sys.executable, "-m", "torch.distributed.run", "--standalone", *words], "", tmp_path)
-        cards.append(read_card(tmp_path / words[-2] / "card.json"))
-    assert [card.steps for card in cards] == [1, 3, 3]
-    assert cards[0].weights_sha256 != cards[1].weights_sha256 == cards[2].weights_sha256
+    first, *others = script("training", 'bash title="terminal"').splitlines()
+    program, *words = shlex.split(first)
+    run([sys.executable, "-m", "torch.distributed.run", "--standalone", *words], "", tmp_path)
+    stopped = read_card(tmp_path / "stopped" / "card.json")
+    run([sys.executable, "-c", FORKED], "\n".join(others), tmp_path)
+    whole = [read_card(tmp_path / name / "card.json") for name in ("stopped", "unbroken")]
+    assert {line.split()[0] for line in others} == {program} == {"torchrun"}
+    assert [card.steps for card in (stopped, *whole)] == [1, 3, 3]
+    assert stopped.weights_sha256 != whole[0].weights_sha256 == whole[1].weights_sha256
 
 
 @pytest.mark.slow

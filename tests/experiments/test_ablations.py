@@ -394,7 +394,9 @@ def test_table_3_is_trained_from_the_beginning_and_its_codes_are_blended(
 ) -> None:
     papers = setting.recipe(replace(BASE, constraint=TABLE3)).train.loss
     assert (papers.volume, papers.arap, papers.blend) == (1e-4, 1e-2, 1.0)
-    monkeypatch.setattr(blends, "pool_of", pool_of.__wrapped__)
+    drawn = pool_of(setting, "T", 4)
+    for module in (ablation_training, blends):
+        monkeypatch.setattr(module, "pool_of", lambda *_: drawn)
     words = ["--steps", "3", "--seeds", "2", "--work", str(tmp_path)]
     assert blends.main(words) == 0
     first = capsys.readouterr()

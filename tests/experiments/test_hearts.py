@@ -10,6 +10,7 @@ from PIL import Image
 
 from meshmatch.experiments.paper import hearts
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.render.picture import Look
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
@@ -49,6 +50,7 @@ def test_chambers_are_shown_and_counted(
     methods = {"DirectMethod": False, "ZoomOut": True, "coded": False}
     for name, turned in methods.items():
         monkeypatch.setattr(hearts, name, lambda *_, turned=turned: SameNumber(turned=turned))
+    monkeypatch.setattr(hearts, "Look", lambda size: Look(size=(size[0] // 2, size[1] // 2)))
     picture = tmp_path / "figure.png"
     assert hearts.main(["--data", str(data), "--picture", str(picture)]) == 0
     rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
@@ -57,7 +59,7 @@ def test_chambers_are_shown_and_counted(
     assert [row["mean_x100"] < 1e-6 for row in rows] == [True, False, True] and rows[0]["pairs"] == 3
     with Image.open(picture) as drawn:
         rows_of = np.split(np.asarray(drawn), 4)
-    assert np.array_equal(rows_of[0][:360], rows_of[1][:360]) and not np.array_equal(rows_of[0][:360], rows_of[2][:360])
+    assert np.array_equal(rows_of[0][:150], rows_of[1][:150]) and not np.array_equal(rows_of[0][:150], rows_of[2][:150])
 
 
 @pytest.mark.slow

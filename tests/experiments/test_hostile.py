@@ -22,13 +22,16 @@ from meshmatch.experiments.hostile.learned import update_hashes
 from meshmatch.experiments.hostile.samples import make_samples
 from meshmatch.models.registry import verify_model
 from meshmatch.templates.template import load_template
+from tests.fitting.small_viscous import use_small_fits
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> list[Sample]:
-    return make_samples(tmp_path_factory.mktemp("samples") / "all")
+    with pytest.MonkeyPatch.context() as patch:
+        use_small_fits(patch)
+        return make_samples(tmp_path_factory.mktemp("samples") / "all")
 
 
 @pytest.mark.filterwarnings("ignore::meshmatch.errors.MeshmatchWarning")

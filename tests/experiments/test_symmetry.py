@@ -13,6 +13,7 @@ from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.shape import Shape
 from tests.conftest import icosphere
+from tests.fitting.small_viscous import use_small_fits
 
 
 def eggs() -> dict[str, Shape]:
@@ -42,7 +43,8 @@ def some(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Specimens:
     return found
 
 
-def test_counterparts_are_found_by_fits(some: Specimens, tmp_path: Path) -> None:
+def test_counterparts_are_found_by_fits(some: Specimens, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_small_fits(monkeypatch)
     row = symmetry.measure("bird", "none", tmp_path, 0, tmp_path / "work")
     assert (row["shapes"], row["keypoints"], row["lost"]) == (3, 12, 0.0)
     assert row["error"] < 5 and set(row["each"]) == {"0", "1", "2"}

@@ -32,6 +32,9 @@ from meshmatch.shapes.shape import Shape
 from meshmatch.templates.mirror_images import alignment_residuals, mirrored
 
 QUICK = DirectConfig(coarse=900, fine=1800, samples=2500, second_samples=1000, first_samples=600, n_second=6, n_third=3)
+QUICKER = replace(
+    QUICK, coarse=300, fine=600, samples=1000, second_samples=400, first_samples=300, n_second=4, n_third=2
+)
 # limbs of a creature: where they point, how long and how wide they are
 LIMBS = (
     ((1, 0.2, 0), 1.2, 0.04),
@@ -354,17 +357,7 @@ def test_goals_are_reached_by_vectors(thin: SimplifiedMesh) -> None:
 
 
 def test_one_correspondence_is_found_from_either_side() -> None:
-    quick = replace(
-        QUICK,
-        coarse=300,
-        fine=600,
-        samples=1000,
-        second_samples=400,
-        first_samples=300,
-        n_second=4,
-        n_third=2,
-        both_ways="always",
-    )
+    quick = replace(QUICKER, both_ways="always")
     box = trimesh.creation.box((1.0, 0.7, 0.4)).subdivide().subdivide()
     first = Shape(np.asarray(box.vertices), np.asarray(box.faces), "box")
     second = Shape(first.verts * [1.05, 1.0, 0.97], first.faces, "longer box")
@@ -410,7 +403,7 @@ def test_a_palm_on_the_back_of_a_hand_asks_for_the_mirror_image(
     source = curled()
     monkeypatch.setattr("meshmatch.fitting.direct.alignment_residuals", lambda *_: (apart * np.exp(nearer), apart))
     monkeypatch.setattr(SimplifiedMesh, "likeness", lambda *_: alike)
-    found = match_either_side(source, mirrored(source), replace(QUICK, n_second=4, n_third=2, both_ways="no"))
+    found = match_either_side(source, mirrored(source), replace(QUICKER, both_ways="no"))
     assert found.target.frame.mirrored is asked
     doubt = any(reason.code == "side" for reason in found.reasons)
     assert doubt == (apart == 0.09) and (not doubt or found.verdict != "good")  # it fits better, but is no more alike
