@@ -189,7 +189,7 @@ def test_what_reads_strangely_is_of_the_kind_that_fits_it(monkeypatch: pytest.Mo
 def test_a_cloud_that_reads_strangely_is_of_the_kind_that_fits_it() -> None:
     dancer = load_shape(SAMPLES / "dancer.ply")
     for points, word in (
-        (dancer.verts, "human"),
+        (dancer.verts, "rough 5 5.6 7: human"),
         (ball("").verts, "may be a part, or a rough cloud: treated as human"),
     ):
         _, words = choose(Shape(points[::4], np.empty((0, 3), np.int64), "rough 5 5.6 7"))
