@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from meshmatch.api import matching
 from meshmatch.api.results import MatchResult
@@ -18,6 +19,7 @@ from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.shape import Shape
 from meshmatch.transfer.landmarks import landmark_positions
 from tests.cli.conftest import FakeMatching, Run, nearest_map, refused, well
+from tests.conftest import icosphere
 
 LABELS = ("transfer-labels", "a.ply", "in", "--labels", "labels.txt", "-o", "out")
 VERBS = {
@@ -40,15 +42,17 @@ MORE = {
 
 
 @pytest.fixture
-def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sphere: Shape, torus: Shape) -> Path:
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A source and a folder of two targets, and what verbs want beside them."""
+    sphere, ring = icosphere(2), trimesh.creation.torus(1.0, 0.4, major_sections=20, minor_sections=12)
+    other = Shape(ring.vertices, ring.faces)
     monkeypatch.chdir(tmp_path)
     Path("in/sub").mkdir(parents=True)
     save_shape("worn.obj", Shape(1.1 * sphere.verts, sphere.faces, "worn"))
     save_shape("moved.ply", Shape(sphere.verts + 0.1, sphere.faces))
     save_shape("a.ply", Shape(sphere.verts, sphere.faces, "a", np.full((sphere.V, 4), 0.5)))
-    save_shape("in/b.ply", torus)
-    save_shape("in/sub/c.glb", torus)
+    save_shape("in/b.ply", other)
+    save_shape("in/sub/c.glb", other)
     Path("labels.txt").write_text("1\n" * sphere.V)
     Path("weights.json").write_text(json.dumps({"weights": [[1.0]] * sphere.V}))
     Path("points.txt").write_text("0\n5\n")
