@@ -1,4 +1,4 @@
-"""Tell integers and numbers from what only behaves like them."""
+"""Tell integers and numbers from what only behaves like them; numbers in messages."""
 
 from numbers import Integral, Real
 from typing import Any, TypeGuard
@@ -14,6 +14,11 @@ def is_integer(value: Any, least: float = float("-inf")) -> TypeGuard[int]:
 def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value is a real number, NumPy's included; a bool is none."""
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def counted(count: int, noun: str) -> str:
+    """A number with its noun, such as "1 shape" or "1,200 shapes"."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def check_seed(seed: object) -> None:

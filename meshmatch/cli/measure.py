@@ -13,6 +13,7 @@ from meshmatch.cli.transfer_options import MapOptionsWithPairs, Picture, Transfe
 from meshmatch.cli.user_messages import Json
 from meshmatch.errors import warn
 from meshmatch.outputs import replace_on_success
+from meshmatch.scalars import counted
 
 _ROW = "{:<28} {:>10} {:>10}"
 _Source = Annotated[
@@ -58,7 +59,7 @@ def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[
         sizes = np.nanmedian(lengths[known] / own.values[are_lengths], axis=1)
         if units := mixed_units([name for name, there in zip(values, known, strict=True) if there], sizes):
             warn(units)
-    return f"wrote {table}: {len(own.names)} measurements of {len(values)} shapes"
+    return f"wrote {table}: {counted(len(own.names), 'measurement')} of {counted(len(values), 'shape')}"
 
 
 def _cell(value: float) -> float | str:
@@ -95,7 +96,7 @@ def measure(
     """Measure a shape: girths, lengths, angles.
 
     Each measurement is defined by landmarks of SRC, which are transferred to TGT, and is in the unit of TGT's file. A girth
-    is measured like with a tape: it does not follow hollows. `meshmatch measure body scan.ply -o scan.csv` takes 30
+    is measured as with a tape: it does not follow hollows. `meshmatch measure body scan.ply -o scan.csv` takes 30
     measurements of a person in any pose.
     """
     import numpy as np
@@ -122,9 +123,8 @@ def measure(
         why = "the confidence is too low there, or the map is discontinuous along a girth"
         console.warn(f"{transfer.names[1]}: {lost} of {len(found.names)} measurements are missing: {why}")
     text = "in the unit of its file; angles in degrees" if "angle" in found.kinds else "in the unit of its file"
-    count = len(found.names) - lost
-    what = "measurement" if count == 1 else "measurements"
-    console.say(f"wrote {output}: {count} {what} of {transfer.names[1]}, {text}")
+    kept = counted(len(found.names) - lost, "measurement")
+    console.say(f"wrote {output}: {kept} of {transfer.names[1]}, {text}")
     if picture is not None:
         from meshmatch.render.compose import compose_lines
 

@@ -98,7 +98,7 @@ class TrainOptions(Options):
     start: str | None = optional(
         "MODEL", "Start from the weights of a trained model with the same template and preset."
     )
-    rate: float | None = Option(None, min=0.0, help="Learning rate; default: the preset's.")
+    rate: float | None = Option(None, min=0.0, help="Learning rate. Default: the preset's.")
     volume: float | None = Option(
         None, min=0.0, metavar="WEIGHT", help="Weight of the volume loss (lambda_2 in the paper)."
     )
@@ -119,12 +119,12 @@ class TrainOptions(Options):
         help="How strongly jointly refined fits are kept at a common stretch of the template; stored on the card. 1 suits "
         "bodies; 0.05 suits shapes that differ more, such as organs.",
     )
-    name: str | None = optional("NAME", "The model's name; default: the folder's.")
+    name: str | None = optional("NAME", "The model's name. Default: the folder's.")
     category: str | None = optional(
-        "NAME", "The category of shapes that the model matches; default: --kind, or with --shapes the model's name."
+        "NAME", "The category of shapes that the model matches. Default: --kind, or with --shapes the model's name."
     )
     licence: str = Option("unstated", help="Terms of use of the weights; stored on the card.")
-    steps: int | None = Option(None, min=1, help="Training steps; default: the preset's.")
+    steps: int | None = Option(None, min=1, help="Training steps. Default: the preset's.")
     minutes: float | None = Option(
         None, min=0.0, help="Stop after this many minutes; the same command continues later."
     )
@@ -167,11 +167,11 @@ class TrainOptions(Options):
         "of its releases (github.com/facebookresearch/MHR).",
     )
     mhr_share: float = Option(0.5, min=0.0, max=1.0, help="Share of the bodies from --mhr.")
-    bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic; default: the preset's choice.")
+    bf16: bool | None = Option(None, "--bf16/--no-bf16", help="bfloat16 arithmetic. Default: the preset's choice.")
     tf32: bool | None = Option(
         None,
         "--tf32/--no-tf32",
-        help="TensorFloat-32 matrix products, on GPUs that support them; default: the preset's choice.",
+        help="TensorFloat-32 matrix products, on GPUs that support them. Default: the preset's choice.",
     )
     compile: bool | None = Option(
         None, "--compile/--no-compile", help="Compile the loss with torch, which takes a minute or two. Default: no."
@@ -185,7 +185,7 @@ class TrainOptions(Options):
         "is a CUDA GPU, else on the CPU.",
     )
     workers: int | None = Option(
-        None, min=0, help="Number of processes that generate batches on the CPU; default: the preset's."
+        None, min=0, help="Number of processes that generate batches on the CPU. Default: the preset's."
     )
     threads: Threads = 1
     seed: Seed = 0

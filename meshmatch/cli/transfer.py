@@ -13,6 +13,7 @@ from meshmatch.cli.transfer_options import MapOptions, MapOptionsWithPairs, Pict
 from meshmatch.cli.user_messages import Json
 from meshmatch.errors import InputError, OptionError, warn
 from meshmatch.outputs import replace_on_success
+from meshmatch.scalars import counted
 
 On = Literal["vertices", "faces"]
 
@@ -243,7 +244,7 @@ def transfer_landmarks(
     min_confidence: float = Option(0.3, min=0.0, max=1.0, help="Landmarks below this confidence are missing on TGT."),
     table: Path | None = optional(
         "FILE",
-        "With several targets, also write one table of all specimens, including SRC: .csv, .tps, Morphologika's .txt, or "
+        "With several targets, also write one table of all shapes, including SRC: .csv, .tps, Morphologika's .txt, or "
         ".npz.",
     ),
     picture: Picture = None,
@@ -275,8 +276,7 @@ def transfer_landmarks(
         more = f" and {len(low) - 10} more" if len(low) > 10 else ""
         listed = f"{', '.join(first_ones)}{more}"
         console.warn(f"{transfer.names[1]}: missing are landmarks of confidence below {min_confidence:g}: {listed}")
-    count = len(found.names) - len(low)
-    console.say(f"wrote {output}: {count} landmark{'s' if count != 1 else ''} on {transfer.names[1]}")
+    console.say(f"wrote {output}: {counted(len(found.names) - len(low), 'landmark')} on {transfer.names[1]}")
     if picture is not None:
         from meshmatch.render.compose import compose_points
 

@@ -11,6 +11,7 @@ from meshmatch.cli.options import RunOptions, grouped, output_option
 from meshmatch.cli.targets import to_targets
 from meshmatch.cli.transfer_options import MapOptions, Picture, Source, Target, Transfer
 from meshmatch.cli.user_messages import Json
+from meshmatch.scalars import counted
 
 _MAX_LISTED = 8  # joints or clips in a note
 
@@ -58,8 +59,8 @@ def transfer_rig(
         count, names = len(result.replaced_clips), _listed(result.replaced_clips)
         what = "clip of that skeleton no longer moves" if count == 1 else "clips of that skeleton no longer move"
         console.warn(f"{count} {what} anything: {names}")
-    played = f", {len(clips)} clip{'s' if len(clips) != 1 else ''}" if clips else ""
-    console.say(f"wrote {output}: {transfer.names[1]} with {joints} joint{'s' if joints != 1 else ''}{played}")
+    played = f", {counted(len(clips), 'clip')}" if clips else ""
+    console.say(f"wrote {output}: {transfer.names[1]} with {counted(joints, 'joint')}{played}")
     if picture is not None:
         from meshmatch.render.compose import compose_labels
         from meshmatch.transfer.attributes import most_votes

@@ -16,6 +16,7 @@ from meshmatch.arrays import Bool, Bools, Float, Floats
 from meshmatch.collections.formula import Factor, Formula, term_name
 from meshmatch.collections.sources import find_name, name_index
 from meshmatch.errors import InputError, OptionError
+from meshmatch.scalars import counted
 from meshmatch.shapes.tables import is_missing, is_number, parse_number, read_by_suffix, read_table
 
 Columns: TypeAlias = Mapping[str, Sequence[Any]]
@@ -98,6 +99,7 @@ def covariates(table: str | Path | Columns | None, names: Sequence[str], sizes: 
         found = _reorder(
             {str(title): ["" if cell is None else str(cell) for cell in table[title]] for title in table}, names
         )
+    _check_titles(list(found))
     found = {normalize("NFC", title): tuple(normalize("NFC", cell) for cell in cells) for title, cells in found.items()}
     found.setdefault(SIZE, tuple(map(repr, sizes.tolist())))
     return Covariates(tuple(names), found)
@@ -111,10 +113,20 @@ def _read_table_file(path: Path) -> tuple[list[str], list[list[str]]]:
     if len(header) < 2 or not rows:
         raise InputError("it has no rows, or one column only", "write a row for each shape, commas between the cells")
     table.check_decimal_marks(rows)
-    duplicate = next((title for title, count in Counter(header).items() if count > 1), None)
-    if duplicate is not None:
-        raise InputError(f"two columns are called {duplicate or 'nothing'}", "the first row has the names of columns")
+    _check_titles(header)
     return header, rows
+
+
+def _check_titles(titles: Sequence[str]) -> None:
+    """`InputError` if two columns have the same name, or names that differ only in how accents are encoded."""
+    counts = Counter(normalize("NFC", title) for title in titles)
+    duplicate = next((title for title, count in counts.items() if count > 1), None)
+    if duplicate is None:
+        return
+    if titles.count(duplicate) > 1:
+        raise InputError(f"two columns are called {duplicate or 'nothing'}", "the first row has the names of columns")
+    how = "with its accents encoded in different ways"
+    raise InputError(f"two columns are called {duplicate}, {how}", "rename one of them")
 
 
 def _normalise_numbers(cells: Sequence[str]) -> tuple[str, ...]:
@@ -243,7 +255,8 @@ def complete_rows(formula: Formula, blocks: str | None, known: Covariates) -> tu
     rows = np.array([name not in lacking for name in known.names], bool)
     if rows.sum() < 4:
         raise OptionError(
-            f"{int(rows.sum())} shapes have all of {', '.join(formula.columns)}", "four or more are needed"
+            f"all of {', '.join(formula.columns)} are known for {counted(int(rows.sum()), 'shape')} only",
+            "four or more are needed",
         )
     return rows, lacking
 

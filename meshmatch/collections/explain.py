@@ -13,8 +13,9 @@ from meshmatch.collections.anova import Variances, analyse
 from meshmatch.collections.covariates import SIZE, Covariates, DesignTerm, complete_rows, design_terms
 from meshmatch.collections.formula import Factor, parse
 from meshmatch.collections.groups import STATISTICS, Statistic
+from meshmatch.collections.permutation import check_permutations
 from meshmatch.errors import OptionError
-from meshmatch.scalars import check_seed, is_integer
+from meshmatch.scalars import check_seed
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +92,7 @@ def explain(
     """
     if kind not in STATISTICS:
         raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
-    if not is_integer(permutations, 1):
-        raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
+    check_permutations(permutations)
     check_seed(seed)
     model = parse(formula)
     if (model.space == "shape") != (scale == "remove"):

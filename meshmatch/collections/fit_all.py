@@ -54,6 +54,7 @@ from meshmatch.maps.vertex_map import VERDICTS
 from meshmatch.models.registry import NO_MODEL
 from meshmatch.outputs import plain_text
 from meshmatch.progress import ProgressCallback
+from meshmatch.scalars import counted
 
 TABLE = "fits.csv"
 COLUMNS = (
@@ -127,7 +128,9 @@ def fit_all(
     fitted = [number for number, record in enumerate(records) if record.fitted]
     if not fitted:
         _write_table(setting.store, records)
-        raise InputError(f"none of {len(records)} shapes could be fitted: {records[0].name}: {records[0].reasons}")
+        raise InputError(
+            f"none of {counted(len(records), 'shape')} could be fitted: {records[0].name}: {records[0].reasons}"
+        )
     usual = None if setting.learned else Compared.of(records)
     agreeing = [number for number in fitted if _is_credible(records[number], usual)]
     parts = [f"{records[number].name} {records[number].digest} {records[number].verdict}" for number in fitted]
@@ -185,26 +188,11 @@ def fit_all_kinds(
 ) -> Fitted:
     """Fit all shapes with the model chosen from the first ones, then shapes of another kind with the model of theirs.
 
-    ``requested`` is the setting as the user gave it, before a model was chosen.
+    Fits of another kind are in a subfolder named after the kind, and their records name it. ``tell`` gets the record of
+    the second fit, or of the first one where the second failed. ``requested`` is the setting as the user gave it, before
+    a model was chosen.
     """
     result = fit_all(setting, sources, workers, agree, progress, _skip_other_kinds(tell))
-    return _fit_other_kinds(result, requested, sources, workers, agree, progress, tell)
-
-
-def _fit_other_kinds(
-    result: Fitted,
-    requested: Setting,
-    sources: Sequence[Source],
-    workers: Workers,
-    agree: bool = True,
-    progress: ProgressCallback | None = None,
-    tell: Callable[[Record], None] | None = None,
-) -> Fitted:
-    """Fit shapes of another kind than the model's with the model of theirs, in a subfolder named after the kind.
-
-    Their records then name that folder. ``tell`` gets the record of the second fit, or of the first one where the
-    second failed.
-    """
     numbers_by_kind: dict[str, list[int]] = defaultdict(list)
     for number, record in enumerate(result.records):
         if record.kind:

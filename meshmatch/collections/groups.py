@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from meshmatch.arrays import Bool, Bools, Float, Floats, ShortRepr, set_read_only
-from meshmatch.collections.permutation import TIE_TOLERANCE, run_tests, whitened
+from meshmatch.collections.permutation import TIE_TOLERANCE, check_permutations, run_tests, whitened
 from meshmatch.errors import OptionError
-from meshmatch.scalars import check_seed, is_integer
+from meshmatch.scalars import check_seed
 
 Statistic = Literal["normal", "hotelling"]
 STATISTICS: tuple[Statistic, ...] = ("normal", "hotelling")
@@ -75,8 +75,7 @@ def compare_groups(
     """
     if kind not in STATISTICS:
         raise OptionError(f"invalid statistic {kind!r}", f"choose one of {', '.join(STATISTICS)}")
-    if not is_integer(permutations, 1):
-        raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
+    check_permutations(permutations)
     check_seed(seed)
     S = len(offsets)
     second = int(in_second.sum())

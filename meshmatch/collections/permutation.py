@@ -17,6 +17,7 @@ import numpy as np
 
 from meshmatch.arrays import Float, Floats, Int, Ints, Ints32
 from meshmatch.errors import OptionError
+from meshmatch.scalars import is_integer
 
 _CHUNK = 2_000_000  # array elements processed at a time
 _MAX_ELEMENTS = 200_000_000  # permutations times shapes
@@ -43,6 +44,16 @@ class PlaceTests:
     p_corrected: Float[Floats, " N"]
     p_fdr: Float[Floats, " N"]
     largest: Float[Floats, " P"]
+
+
+def check_permutations(count: object) -> None:
+    """Raise `OptionError` unless the number of permutations is an integer of 1 or more."""
+    if not is_integer(count):
+        raise OptionError(
+            f"the number of permutations must be a whole number, not {count!r}", "1,000 or more are usual"
+        )
+    if count < 1:
+        raise OptionError("a permutation test needs at least one permutation", "1,000 or more are usual")
 
 
 def orders(groups: Int[Ints, " S"], max_count: int, seed: int) -> tuple[Int[Ints32, "P S"], bool]:

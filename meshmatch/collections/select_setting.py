@@ -20,6 +20,7 @@ from meshmatch.fitting.kind_templates import mean_shape, template_of, with_final
 from meshmatch.fitting.solve.viscous import ViscousConfig
 from meshmatch.models.registry import AUTO, NO_MODEL
 from meshmatch.outputs import replace_on_success
+from meshmatch.scalars import counted
 from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.rims import is_sheet
 from meshmatch.shapes.shape import Shape
@@ -86,7 +87,7 @@ def _first_template(requested: Setting, sources: Sequence[Source], new: bool) ->
         with suppress(MeshmatchError):
             found.append(repair_or_raise(sources[number].load(requested.only, requested.without)))
     if not found:
-        raise InputError(f"none of {len(some)} shapes can be a template", "are they meshes?")
+        raise InputError(f"none of {counted(len(some), 'shape')} can be a template", "are they meshes?")
     sided = requested.config.mirror != "no" and not all(
         is_sheet(each.shape) for each in found
     )  # a leaf only turns over

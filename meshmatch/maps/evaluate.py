@@ -35,6 +35,7 @@ CM_PER_UNIT = 100.0 * float(np.sqrt(SKIN_M2))
 LOST_CM = 15.0
 """A point with a larger error is on the wrong limb; a pair with a larger mean error is a left-right flip."""
 _TRUTH_HINT = "give one target vertex for every source vertex, or a pair of lists of the same length"
+_MAX_ERROR = float(np.finfo(np.float32).max)  # of the type of errors; larger thresholds count as this
 _LOST_ERROR = 0.1  # an error above this is a point in a wrong place, on shapes other than people; units of sqrt(area)
 
 
@@ -194,7 +195,7 @@ class Errors(ShortRepr, PickledFields):
         float
             From 0 to 1.
         """
-        return float((self.values > cm / CM_PER_UNIT).mean())
+        return float((self.values > min(float(cm) / CM_PER_UNIT, _MAX_ERROR)).mean())
 
     def curve(self, thresholds: ArrayLike) -> Floats:
         """Share of the points with an error of at most each threshold.
@@ -423,8 +424,8 @@ class Evaluation:
         """
         if self.errors is None:
             return float("nan")
-        limit = (self.unit.lost if threshold is None else threshold) / self.unit.factor
-        return float((self.errors.values > limit).mean())
+        limit = float(self.unit.lost if threshold is None else threshold) / float(self.unit.factor)
+        return float((self.errors.values > min(limit, _MAX_ERROR)).mean())
 
 
 def evaluate_map(

@@ -26,6 +26,7 @@ CLAY: Color = (0.85, 0.82, 0.78)
 _WARM = ((0.93, 0.025, 85), (0.86, 0.12, 88), (0.74, 0.165, 58), (0.58, 0.20, 28), (0.40, 0.15, 2), (0.27, 0.10, 335))
 _COLD = ((0.93, 0.025, 85), (0.80, 0.09, 230), (0.62, 0.14, 252), (0.44, 0.15, 264), (0.30, 0.11, 275))
 _N_COLORS = 256
+_MAX_NUMBER = 1e300  # at the ends of a scale; positions on larger ones overflow
 _NO_CHARACTER = "\ufffe"
 # Latin letters that do not decompose into a letter and an accent.
 _PLAIN = {"ß": "ss", "ẞ": "SS", "æ": "ae", "Æ": "AE", "œ": "oe", "Œ": "OE", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L"}
@@ -66,8 +67,9 @@ class Scale:
     unknown: bool = False
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
-            raise OptionError(f"a scale cannot run from {self.low:g} to {self.high:g}", "the lower number comes first")
+        if not (self.low < self.high and max(abs(self.low), abs(self.high)) < _MAX_NUMBER):
+            hint = "the lower number comes first" if self.low >= self.high else f"give numbers below {_MAX_NUMBER:g}"
+            raise OptionError(f"a scale cannot run from {self.low:g} to {self.high:g}", hint)
 
     @classmethod
     def of(cls, values: ArrayLike, title: str = "", limits: tuple[float, float] | None = None) -> Scale:
@@ -88,7 +90,8 @@ class Scale:
         if self.low < 0 < self.high and not self.reverse:  # both signs need a color
             share = np.clip(safe / max(-self.low, self.high), -1, 1)
         else:
-            share = np.clip((safe - self.low) / (self.high - self.low), 0, 1)
+            with np.errstate(over="ignore"):  # of a tiny range; clipped
+                share = np.clip((safe - self.low) / (self.high - self.low), 0, 1)
             share = 1 - share if self.reverse else share
         at = np.round(np.abs(share) * (_N_COLORS - 1)).astype(int)
         return np.where(

@@ -36,6 +36,7 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 # Maximum geodesic distance between two vertices that one node moves, as shares of the geodesic diameter. If parts are so
 # close that a vertex gets no nodes, the next share is tried. Set by hand.
 _GEODESIC_SHARES = (0.2, 0.3, 0.45, 1.0)
+_MAX_RADIUS = 1000.0  # of a node, in units of sqrt(area); squares of huge ones overflow
 _N_EIGENVECTORS = 4  # eigenvectors used for spectral clusters, as in the paper
 # nodes around a vertex whose radii grow, factor per step, maximum number of steps (twofold in all)
 _N_GROWING, _GROWTH_FACTOR, _MAX_GROWTH_STEPS = 6, 1.05, 15
@@ -69,8 +70,10 @@ class NodeConfig:
             raise OptionError(
                 f"K must be an integer of 4 or more, not {self.K!r}", "moving least squares needs at least 4"
             )
-        if not 0 < self.radius < np.inf:
-            raise OptionError(f"a node radius must be positive, not {self.radius:g}", "0.13 suits a body")
+        if not 0 < self.radius <= _MAX_RADIUS:
+            raise OptionError(
+                f"a node radius must lie above 0 and at most {_MAX_RADIUS:g}, not {self.radius:g}", "0.13 suits a body"
+            )
         if not 0 <= self.depth < np.inf:
             raise OptionError(f"a depth of candidates must be 0 or more, not {self.depth:g}")
         if not is_integer(self.clusters, 1):

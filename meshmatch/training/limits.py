@@ -30,6 +30,8 @@ T = TypeVar("T")
 def check_range(name: str, value: float, label: str = "") -> None:
     """Raise `OptionError` unless a setting lies in its range; ``label`` is its name in the message."""
     low, high = _MIN_VALUES.get(name, 0), _MAX_VALUES.get(name, 2**53)
+    if value < low and name not in _MAX_VALUES:
+        raise OptionError(f"{label or name} must be at least {low}, not {value}")
     if not low <= value <= high:
         raise OptionError(f"{label or name} must lie in {low}..{high:,}, not {value}")
 

@@ -86,7 +86,7 @@ PAIRS: Any = (ROW.names[:2], ROW.names[2:])
     lambda: open_workers(True).__enter__(), lambda: fit_implicit(BALL, BALL, steps=True),
 ])  # fmt: skip
 def test_a_bool_is_no_number(call: Callable[[], Any]) -> None:
-    with pytest.raises(MeshmatchError, match=r"True|at least one perm|positive rate"):
+    with pytest.raises(MeshmatchError, match=r"True|positive rate"):
         call()
 
 

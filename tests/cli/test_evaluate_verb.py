@@ -1,5 +1,6 @@
 """`evaluate` measures what a map file says against shapes and truth."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,15 @@ def test_threshold(evaluate: Callable[[str], Answer]) -> None:
     )
     # vertex 0 itself may be among those thrown to it, and is right
     assert 63 / V <= all_wrong <= 64 / V and none == 0.0
+
+
+@pytest.mark.parametrize("unit", ["cm", "file", "x100"])
+def test_a_huge_threshold_does_not_overflow(evaluate: Callable[[str], Answer], unit: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        assert (
+            evaluate(f"--truth column.txt --unit {unit} --threshold 1e308 --json").record["share_over_threshold"] == 0
+        )
 
 
 def test_a_threshold_is_a_length(run: Run, folder: Path) -> None:

@@ -53,6 +53,9 @@ def test_a_single_measurement_is_in_the_singular(run: Run, copies: Shape) -> Non
     Path("own.csv").write_text("name,kind,a,b\nreach,distance,left fingertip,right fingertip\n")
     answer = well(run("measure", "body", "in/small.ply", "-o", "out.csv", "--measurements", "own.csv"))
     assert "wrote out.csv: 1 measurement of small.ply" in answer.err
+    Path("in/large.ply").unlink()
+    answer = well(run("measure", "body", "in", "-o", "out", "--measurements", "own.csv", "--table", "all.csv"))
+    assert "wrote all.csv: 1 measurement of 1 shape\n" in answer.err
 
 
 def test_all_are_one_table_whose_units_are_told(run: Run, copies: Shape) -> None:

@@ -313,6 +313,8 @@ BAD: list[tuple[str, str]] = [
     ("a.ply b.ply --values v.npy", "--values 2 times"),
     ("a.ply --values v.npy --range 2 1", "cannot run from 2 to 1"),
     ("a.ply --values v.npy --range nan 1", "cannot run"),
+    ("a.ply --values v.npy --range -1e308 1e308", "cannot run"),
+    ("a.ply --values v.npy --range 0 1e308", "cannot run"),
     ("a.ply --range 0 1", "needs a color scale"),
     ("a.ply --title x", "--title needs"),
     ("a.ply --on faces", "--on needs"),

@@ -260,8 +260,9 @@ def test_what_cannot_be_explained() -> None:
             atlas.anova(formula, ages)
     with pytest.raises(OptionError, match="statistic"):
         atlas.anova("form ~ age", ages, kind="welch")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="permutation"):
-        atlas.anova("form ~ age", ages, permutations=0)
+    for count, words in ((0, "at least one permutation"), (2.5, "must be a whole number, not 2.5")):
+        with pytest.raises(OptionError, match=words):
+            atlas.anova("form ~ age", ages, permutations=count)  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="too many"):
         orders(np.zeros(40, np.int64), 10**9, 0)
 

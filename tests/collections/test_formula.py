@@ -110,6 +110,16 @@ def test_names_and_categories_are_the_same_in_other_unicode(tmp_path: Path) -> N
     assert known.column(f"t{decomposed}") == (composed, composed, "o", "o")
 
 
+def test_columns_that_differ_only_in_unicode_are_refused(tmp_path: Path) -> None:
+    """The second would silently replace the first."""
+    titles = [unicodedata.normalize(form, "été") for form in ("NFD", "NFC")]
+    file = write(tmp_path / "t.csv", f"name,{','.join(titles)}", *(f"{name},1,2" for name in NAMES))
+    for table in (file, {title: [k] * len(NAMES) for k, title in enumerate(titles)}):
+        with pytest.raises(InputError, match=f"two columns are called {titles[1]}, with its accents") as caught:
+            covariates(table, NAMES, SIZES)
+        assert caught.value.hint == "rename one of them"
+
+
 @pytest.mark.parametrize(
     ("rows", "formula", "words"),
     [
@@ -127,7 +137,11 @@ def test_names_and_categories_are_the_same_in_other_unicode(tmp_path: Path) -> N
             "x",
             "not finite, or huge, for b.1",
         ),
-        (["name,x", *(f"{name},{'NA' if k else 1}" for k, name in enumerate(NAMES))], "x", "1 shapes have all of x"),
+        (
+            ["name,x", *(f"{name},{'NA' if k else 1}" for k, name in enumerate(NAMES))],
+            "x",
+            "x are known for 1 shape only",
+        ),
     ],
 )
 def test_what_a_table_cannot_say(tmp_path: Path, rows: list[str], formula: str, words: str) -> None:

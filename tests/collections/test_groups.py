@@ -121,5 +121,6 @@ def test_what_cannot_be_compared() -> None:
         atlas.compare(names[:2], names[2:], kind="hotelling")
     with pytest.raises(OptionError, match="statistic"):
         atlas.compare(names[:2], names[2:], kind="welch")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="permutation"):
-        atlas.compare(names[:2], names[2:], permutations=0)
+    for count, words in ((0, "at least one permutation"), (2.5, "must be a whole number, not 2.5")):
+        with pytest.raises(OptionError, match=words):
+            atlas.compare(names[:2], names[2:], permutations=count)  # type: ignore[arg-type]
