@@ -78,8 +78,8 @@ def prepare(
     """Prepare shapes and a template for training.
 
     The shapes of a folder are checked, normalised, decimated and aligned with the template. `meshmatch train --shapes
-    FOLDER` then learns from them: from their correspondence if all share the template's vertices and triangles,
-    otherwise without it. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a folder,
+    FOLDER` then learns from them: from their correspondence if all are registered (share the template's vertices and
+    triangles), otherwise without it. Writes template.safetensors, a picture of the nodes (nodes.png) and, from a folder,
     shapes.safetensors, points.safetensors, normalised/ and prepared.json.
     """
     from meshmatch.api.prepare import PrepareConfig
