@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from meshmatch.api.results import MapPair
 from meshmatch.api.skeletons import INFLUENCES
@@ -25,7 +26,7 @@ from meshmatch.shapes.deformed_files import add_appearance, warn_about_lost
 from meshmatch.shapes.files import ShapeLike, as_gltf_scene, as_shape, load_shape
 from meshmatch.shapes.formats import gltf, gltf_vrm
 from meshmatch.shapes.formats.gltf_add_skeleton import with_skeleton
-from meshmatch.shapes.formats.gltf_attachments import find_rigid_groups, find_separate_figures
+from meshmatch.shapes.formats.gltf_attachments import find_rigid_groups, find_separate_figures, find_skins
 from meshmatch.shapes.formats.gltf_edit import record_source_mesh
 from meshmatch.shapes.formats.gltf_humanoid import HumanoidBones, find_humanoid_bones, with_humanoid_bones
 from meshmatch.shapes.formats.gltf_rig import Binding, Rig, read_rig
@@ -189,6 +190,35 @@ def _warn_of_lying_clips(a: Shape, rig: Rig, weights: SkinWeights, up: str, targ
         warn(f"{a.name} lies in its file, where {up} is up, and {target} will lie in {named}: export it with y up")
 
 
+def _matched_skeleton(
+    source: Path, data: bytes, rig: Rig, weights: SkinWeights, maps: MapPair
+) -> tuple[Rig, SkinWeights]:
+    """The skeleton, with its weights, of what was fitted; of all without a fit. Warns of joints and clips that are left out.
+
+    `InputError` if what was fitted has no skeleton.
+    """
+    repaired = getattr(maps.match.source_fit, "repaired", None) if maps.match is not None else None
+    if repaired is None or repaired.original.is_cloud:
+        return rig, weights
+    fitted = np.zeros(maps.source.V, bool)
+    fitted[repaired.original.faces[repaired.kept_face]] = True
+    used = gltf.parse_document(source, data, "skin makes", lambda document: find_skins(document, fitted))
+    used |= np.asarray(weights.matrix[fitted].sum(axis=0)).ravel() > 0
+    if not used.any():
+        hint = "choose other parts, see `meshmatch info`"
+        raise InputError(f"what was matched of {maps.source.name} has no skeleton", hint)
+    kept = rig.nodes_around(used)
+    columns = np.flatnonzero(kept[rig.joints])
+    found = rig.restricted_to(kept)
+    n_joints, n_clips = len(rig.joints) - len(columns), len(rig.clips) - len(found.clips)
+    if not n_joints:
+        return rig, weights
+    joints, clips = (f"{n} {what}{'s' if n > 1 else ''}" for n, what in ((n_joints, "joint"), (n_clips, "clip")))
+    what = f"{joints} and {clips}" if n_clips else joints
+    warn(f"{what} of {maps.source.name} are of other figures than the one that was matched, and left out")
+    return found, SkinWeights(csr_array(weights.matrix[:, columns]), tuple(weights.names[k] for k in columns))
+
+
 def _refuse_copies(target: Shape, forward: VertexMap) -> None:
     """Raise `InputError` if the scene contains copies of the matched figure: all would follow the skeleton in one of them.
 
@@ -249,10 +279,10 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     sqrt_area_frame(source_shape)  # refuses a skeleton that collapses its skin, from which no joint can be placed
     if source.suffix.lower() not in gltf.SUFFIXES:
         raise InputError(f"{source_shape.name} has no skeleton", f"rigs come in {', '.join(gltf.SUFFIXES)}")
-    data = read_bytes(source)
-    rig, weights = read_rig(source, data), load_weights(source, source_shape)
+    source_data = read_bytes(source)
+    rig, weights = read_rig(source, source_data), load_weights(source, source_shape)
     if n_constraints := gltf.parse_document(
-        source, data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)
+        source, source_data, "scene makes", lambda doc: gltf_vrm.springs_and_constraints(doc.json)
     ):
         what = (
             "a spring or constraint, which is"
@@ -265,6 +295,7 @@ def transfer_rig(source: str | Path, target: ShapeLike, match: MapLike = None, *
     path, data, in_gltf = as_gltf_scene(target, target_shape)
     rigid_groups = gltf.parse_document(path, data, "scene makes", find_rigid_groups)
     maps = find_maps(source_shape, target_shape, match)
+    rig, weights = _matched_skeleton(source, source_data, rig, weights, maps)
     kept_figures = gltf.parse_document(
         path, data, "scene makes", lambda document: find_separate_figures(document, maps.forward.index)
     )

@@ -21,8 +21,10 @@ from meshmatch.shapes.formats.gltf import Document, digest
 from meshmatch.shapes.formats.gltf_attachments import find_rigid_groups
 from meshmatch.shapes.formats.gltf_edit import Editor
 from meshmatch.shapes.formats.gltf_rig import read_rig
+from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.shapes.textured_files import load_appearance, load_coordinates
+from tests.conftest import some_fit
 from tests.shapes.painted import encoded, quarters, write_document
 from tests.transfer.rigs import AROUND, BEND, KNEE, NODES, posed_verts, tube, volume, weights_of, write_tube
 
@@ -480,6 +482,73 @@ def test_a_thing_apart_keeps_its_skeleton(source: Path, alike: bool, away: float
     assert bones == [*(JOINTS if replaced else names)]
     assert np.abs(load_shape(out).verts - stood).max() < 1e-5
     assert np.abs(posed_verts(out, "bend", 1.0)[: tube().V] - posed_verts(source, "bend", 1.0)).max() < 1e-4
+
+
+def two_figures(path: Path, clip: str = "wave") -> Shape:
+    """Write two tubes with a skeleton each below one root, the second with a clip; return the scene."""
+    write_tube(path)
+    before = Document(path, path.read_bytes()).json
+    names = ("root", "pole", "cloth", "end")
+    nodes = [*before["nodes"], {"name": "flag", "mesh": 1, "skin": 1}]
+    nodes += [{"name": "root", "translation": [5, 0, 0], "children": [9, 10, 11]}]
+    nodes += [{"name": name, "translation": [0, y, 0]} for name, y in zip(names[1:], (0.0, 1.0, 1.9), strict=True)]
+    nodes += [{"name": "pack", "children": [0, 6, 7, 8]}]
+    meshes = [before["meshes"][0]] * 2
+    skins = [before["skins"][0], {"joints": [8, 9, 10, 11]}]
+    channels = [{"sampler": 0, "target": {"node": 9, "path": "rotation"}}]
+    clips = [
+        *before["animations"],
+        {"name": clip, "samplers": before["animations"][0]["samplers"], "channels": channels},
+    ]
+    write_tube(path, nodes=nodes, meshes=meshes, skins=skins, animations=clips, scenes=[{"nodes": [12]}])
+    return load_shape(path)
+
+
+def fitted_pair(source: Shape, target: Shape, index: np.ndarray) -> meshmatch.MatchResult:
+    """A match by this map, whose source was fitted where its weights are not 0."""
+    order = np.flatnonzero(source.weights)[: target.V]
+    forward, backward = (
+        VertexMap.between(source, target, index, verdict="good"),
+        VertexMap.between(target, source, order),
+    )
+    known = some_fit(source.verts[:3], np.array([[0, 1, 2]]), repaired=repair(source))
+    return meshmatch.MatchResult(forward, known, known, 0.0, (), (known, known), opposite=backward)
+
+
+@pytest.mark.parametrize(
+    ("number", "bones", "clip"), [(0, NODES[:-1], "bend"), (1, ("root", "pole", "cloth", "end"), "wave")]
+)
+def test_one_figure_of_two_gives_its_skeleton_alone(
+    source: Path, number: int, bones: tuple[str, ...], clip: str
+) -> None:
+    """That of the figure that was fitted, with its ancestors and clips."""
+    a, b = two_figures(source), tube()
+    target = source.with_name("target.ply")
+    save_shape(target, b)
+    fitted = replace(a, weights=(np.arange(a.V) // b.V == number).astype(float))
+    with pytest.warns(
+        MeshmatchWarning, match=r"^4 joints and 1 clip of source.glb are of other figures than the one that"
+    ):
+        result = meshmatch.transfer_rig(
+            source, target, lambda *_: fitted_pair(fitted, load_shape(target), np.arange(a.V) % b.V)
+        )
+    assert result.rig.names == ("source", "pack", *bones)
+    assert [each.name for each in result.rig.clips] == [clip]
+    assert len(result.weights.names) == len(result.rig.joints) == 4
+    assert np.allclose(result.weights.matrix.sum(axis=1), 1)
+    assert result.unused == ()
+
+
+def test_what_was_fitted_may_have_no_skeleton(source: Path) -> None:
+    write_tube(source)
+    before = Document(source, source.read_bytes()).json
+    write_tube(
+        source, nodes=[*before["nodes"], {"name": "statue", "mesh": 0}], scenes=[{"nodes": [0, 6, 7]}]
+    )  # fmt: skip
+    a, b = load_shape(source), tube()
+    fitted = replace(a, weights=(np.arange(a.V) >= b.V).astype(float))
+    with pytest.raises(InputError, match=r"what was matched of source\.glb has no skeleton"):
+        meshmatch.transfer_rig(source, b, lambda *_: fitted_pair(fitted, b, np.arange(a.V) % b.V))
 
 
 @pytest.mark.parametrize("skinned", [True, False])

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from meshmatch.arrays import Ints
+from meshmatch.arrays import Bool, Bools, Ints
 from meshmatch.errors import warn
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.formats.gltf_attributes import joint_nodes
 from meshmatch.shapes.formats.gltf_edit import Editor, drawn_nodes
 from meshmatch.shapes.formats.gltf_prune import can_edit_nodes
 from meshmatch.shapes.formats.gltf_rig import Binding
@@ -85,6 +86,17 @@ def find_separate_figures(document: Document, hit: Ints) -> dict[int, str]:
     apart = {skin for skin in set(skin_of.values()) if matched_skins and joints[skin] and is_apart(joints[skin])}
     found = [number for number, skin in skin_of.items() if skin in apart]
     return {number: plain_text(str(document.nodes[number].get("name") or f"node {number}")) for number in found}
+
+
+def find_skins(document: Document, hit: Bool[Bools, " V"]) -> Bool[Bools, " J"]:
+    """Joints, in the order of `joint_nodes`, of all skins that draw a mesh with some of these vertices."""
+    joints: set[int] = set()
+    n_verts = 0
+    for number, primitive, _ in document.primitives():
+        rows = slice(n_verts, n_verts := n_verts + document.count(primitive["attributes"]["POSITION"]))
+        if "skin" in document.nodes[number] and hit[rows].any():
+            joints.update(map(int, document.json["skins"][document.nodes[number]["skin"]]["joints"]))
+    return np.isin(joint_nodes(document), list(joints))
 
 
 def count_vertices(document: Document, parts: dict[int, dict[str, Any]]) -> int:

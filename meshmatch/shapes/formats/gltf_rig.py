@@ -6,6 +6,7 @@ Specification: Khronos glTF 2.0, sections 3.7.3 and 3.11.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from meshmatch.arrays import Float, Floats, Floats32, Int, Ints, ShortRepr
+from meshmatch.arrays import Bool, Bools, Float, Floats, Floats32, Int, Ints, ShortRepr
 from meshmatch.errors import InputError
 from meshmatch.outputs import plain_text
 from meshmatch.shapes.formats.gltf import Document, local_matrix, parse_document
@@ -77,6 +78,33 @@ class Rig(ShortRepr):
             if parent >= 0:
                 found[node] = found[parent] @ found[node]
         return found
+
+    def nodes_around(self, used: Bool[Bools, " J"]) -> Bool[Bools, " N"]:
+        """Nodes of some joints: they, and all nodes below and above them."""
+        below = np.zeros(len(self.parents), bool)
+        below[self.joints[used]] = True
+        for node, parent in enumerate(self.parents.tolist()):
+            below[node] |= parent >= 0 and below[parent]
+        around = below.copy()
+        for node in reversed(np.flatnonzero(self.parents >= 0).tolist()):
+            around[self.parents[node]] |= around[node]
+        return around
+
+    def restricted_to(self, kept: Bool[Bools, " N"]) -> Rig:
+        """The skeleton of some nodes, which include the parents of each, and the clips that move them."""
+        index = np.cumsum(kept) - 1
+        tracks = [
+            tuple(replace(each, node=int(index[each.node])) for each in clip.tracks if kept[each.node])
+            for clip in self.clips
+        ]
+        return Rig(
+            tuple(compress(self.names, kept)),
+            np.where(self.parents < 0, -1, index[self.parents])[kept],
+            index[self.joints[kept[self.joints]]],
+            *(self.rotations[kept], self.translations[kept], self.scales[kept]),
+            tuple(replace(clip, tracks=own) for clip, own in zip(self.clips, tracks, strict=True) if own),
+            tuple(compress(self.extras, kept)),
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
