@@ -1,6 +1,6 @@
 """Write meshes with moved vertices.
 
-A glb or ply keeps everything in its file but the positions, and an obj keeps its text and its materials.
+A glb or ply keeps everything in its file but the positions, and an obj its text; materials and images are copied.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from meshmatch.geometry.trees import cKDTree
 from meshmatch.outputs import make_folder, replace_all_on_success
 from meshmatch.shapes.appearance import Appearance, BakedMaterial
 from meshmatch.shapes.colors import linear_to_bytes
-from meshmatch.shapes.dressed_files import Dressed, content_beyond_triangles
+from meshmatch.shapes.dressed_files import Dressed, content_beyond_triangles, find_companions
 from meshmatch.shapes.files import check_suffix, load_shape, save_shape
-from meshmatch.shapes.formats import gltf, obj_appearance, obj_text
+from meshmatch.shapes.formats import gltf, obj_text
 from meshmatch.shapes.formats.gltf_add_skeleton import with_skeleton
 from meshmatch.shapes.formats.gltf_edit import Editor, record_source_mesh
 from meshmatch.shapes.formats.gltf_join import add_scene
@@ -69,12 +69,12 @@ class MovedFile:
             check_suffix(output)
         else:
             check_insertion(into, output)
-        if original is None or not (output.suffix.lower() == original.suffix.lower() == ".obj"):
+        if original is None or not (output.suffix.lower() == original.suffix.lower() in (".obj", ".ply")):
             return cls(output, original)
         source_folder, output_folder = original.parent.resolve(), output.parent.resolve()
         if source_folder == output_folder:
             return cls(output, original)
-        companions, missing_names = obj_appearance.companions(original, read_bytes(original))
+        companions, missing_names = find_companions(original)
         if missing_names:
             warn(f"{original.name} names {', '.join(missing_names)[:200]}, which is not there: not copied")
         copies = []

@@ -14,7 +14,18 @@ from meshmatch.errors import OptionError, warn
 from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
-from meshmatch.shapes.formats import TexturedMesh, gltf, gltf_write, obj, obj_text, off, ply, vtk
+from meshmatch.shapes.formats import (
+    TexturedMesh,
+    gltf,
+    gltf_write,
+    obj,
+    obj_appearance,
+    obj_text,
+    off,
+    ply,
+    ply_appearance,
+    vtk,
+)
 from meshmatch.shapes.formats.gltf import Document
 from meshmatch.shapes.formats.gltf_edit import record_source_mesh
 from meshmatch.shapes.formats.gltf_materials import with_material, with_vertex_colors
@@ -68,7 +79,7 @@ class Dressed(ShortRepr):
             places[0].write_bytes(self._glb())
         else:
             self._write_obj(path, places)
-        warn_about_losses(self.file, path)
+        warn_about_losses(self.file, path, own_materials=True)
 
     def _glb(self) -> bytes:
         """The mesh with its material as glb: the edited original, or a new file."""
@@ -187,12 +198,27 @@ def glb_base(file: Path | None, shape: Shape) -> tuple[Path, bytes, bool]:
     return Path(f"{name}.glb"), gltf_write.glb_of(bare_shape), False
 
 
-def warn_about_losses(file: Path | None, path: Path, kept: bool = True) -> None:
+def find_companions(file: Path) -> tuple[list[Path], list[str]]:
+    """Find the material files and images that an obj or ply refers to. Returns them, and the names without a file."""
+    find = {".obj": obj_appearance.companions, ".ply": ply_appearance.companions}.get(file.suffix.lower())
+    return ([], []) if find is None else find(file, read_bytes(file))
+
+
+def warn_about_losses(file: Path | None, path: Path, kept: bool = True, own_materials: bool = False) -> None:
     """Warn about what an output lacks of its original file.
 
-    Nothing is missing if both have the same format and all of it was ``kept``.
+    If both have the same format and all of it was ``kept``, only files in another folder are missing: those of materials
+    and images to which the output refers, unless it has ``own_materials``.
     """
     before, after = ("" if each is None else each.suffix.lower() for each in (file, path))
+    if file is not None and file.is_file() and before == after and kept and not own_materials:
+        folder = path.parent.resolve()
+        files = [] if file.parent.resolve() == folder else find_companions(file)[0]
+        copies = {each: folder / each.resolve().relative_to(file.parent.resolve()) for each in files}
+        if missing := [each.name for each, copy in copies.items() if not copy.exists()]:
+            warn(
+                f"{path.name} refers to {', '.join(missing)[:200]}, beside {file.name} but not beside it: copy the files"
+            )
     after = ".glb" if blender.is_converted(path) else after  # Blender writes these through a glb
     if (
         file is None

@@ -66,6 +66,23 @@ def test_a_vtp_keeps_its_arrays(run: Run, pair: Path) -> None:
     assert list(point_arrays(Path("labels.vtp"))) == ["thickness", "label"]
 
 
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+def test_files_that_the_output_names_but_lacks_are_told(run: Run, pair: Path, suffix: str) -> None:
+    """The text of the target is kept, with the names of its images or materials, which are not copied."""
+    save_shape(f"b.{suffix}", load_shape("b.ply"))
+    Path("far").mkdir()
+    text = Path(f"b.{suffix}").read_bytes()
+    names = text.replace(b"element vertex", b"comment TextureFile skin.png\nelement vertex", 1)
+    Path(f"b.{suffix}").write_bytes(names if suffix == "ply" else b"mtllib b.mtl\n" + text)
+    Path("b.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    Path("skin.png").write_bytes(b"an image")
+    named = "skin.png" if suffix == "ply" else "b.mtl, skin.png"
+    command = ["transfer-color", "a.ply", f"b.{suffix}", "--map", "ab.npz", "-o"]
+    told = f"warning: out.{suffix} refers to {named}, beside b.{suffix} but not beside it: copy the files\n"
+    assert told in well(run(*command, f"far/out.{suffix}")).err
+    assert "refers to" not in well(run(*command, f"out.{suffix}")).err
+
+
 @pytest.mark.parametrize("out", ["out.ply", "out.glb", "out.obj", "out.off", "out.npy", "out.csv"])
 def test_colors_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
     answer = well(run(*call("color", out=out)))

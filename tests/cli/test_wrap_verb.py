@@ -42,6 +42,20 @@ def test_the_text_stays_and_the_distance_is_printed(run: Run, files: Path) -> No
     assert Path("p.png").is_file()
 
 
+def test_the_images_of_a_ply_come_along(run: Run, files: Path) -> None:
+    save_shape("base.ply", rod())
+    named = b"comment TextureFile maps\\My Skin.png\ncomment TextureFile gone.png\nelement vertex"
+    Path("base.ply").write_bytes(Path("base.ply").read_bytes().replace(b"element vertex", named, 1))
+    for folder in ("maps", "out"):
+        Path(folder).mkdir()
+    Path("maps/my skin.png").write_bytes(b"an image")
+    answer = well(run("wrap", "base.ply", "scan.ply", "-o", "out/base.ply", "--json"))
+    assert answer.record["files"] == ["out/base.ply", "out/maps/my skin.png"]
+    assert "warning: base.ply names gone.png, which is not there: not copied\n" in answer.err
+    assert Path("out/maps/my skin.png").read_bytes() == b"an image"
+    assert named in Path("out/base.ply").read_bytes()
+
+
 def test_faces_may_run_the_other_way(run: Run, files: Path) -> None:
     """As those of a node of negative scale do: what faces as a vertex does is there all the same."""
     shape = rod()

@@ -37,7 +37,7 @@ def read_appearance(path: Path, data: bytes, shape: Shape, reader: ImageReader, 
     """
     content = parsed(path.name, data)
     uv, has_uv, image_index = _coordinates(path.name, content, shape)
-    names = [(found[1] or found[2]).strip() for comment in content.comments if (found := _TEXTURE.match(comment))]
+    names = _image_names(content)
     if picture is not None:
         if not has_uv.any():
             raise appearance.no_coordinates(path.name)
@@ -65,6 +65,18 @@ def read_coordinates(path: Path, data: bytes, shape: Shape) -> Float[Floats, "F 
     """Read texture coordinates of all faces, v down; None if any face has none. `shape` is read from the same file."""
     uv, has_uv, _ = _coordinates(path.name, parsed(path.name, data), shape)
     return uv if has_uv.all() else None
+
+
+def companions(path: Path, data: bytes) -> tuple[list[Path], list[str]]:
+    """Find the images that a ply names, in its folder or below it. Returns them, and the names without a file."""
+    files = {name: find_companion(path.parent, name) for name in _image_names(parsed(path.name, data))}
+    found = dict.fromkeys(file for file in files.values() if file is not None)
+    return list(found), [name for name, file in files.items() if file is None]
+
+
+def _image_names(content: Content) -> list[str]:
+    """Names of images in header comments."""
+    return [(found[1] or found[2]).strip() for comment in content.comments if (found := _TEXTURE.match(comment))]
 
 
 def _image(path: Path, name: str, reader: ImageReader, shape: Shape) -> Pixels | None:
