@@ -267,8 +267,18 @@ def maps_of_fits(
     if source is not None and target is not None:
         partial = _partial(first) or _partial(second)
         found, back = unfold_pair(found, lambda: build_map(there, here, threads), source, target, partial, threads)
+        found, back = _repeat_for_copies(found, first), back and _repeat_for_copies(back, second)
     ups = [fit.up if isinstance(fit, Fit) else "" for fit in fits]
     return replace(found, source_up=ups[0], target_up=ups[1]), back
+
+
+def _repeat_for_copies(found: VertexMap, fit: Fit | ImplicitFit) -> VertexMap:
+    """The map with the images of a figure also for its copies elsewhere in the scene, whose folds were not removed."""
+    part = fit.repaired if isinstance(fit, Fit) else None
+    if part is None or part.copied is None:
+        return found
+    rows = np.where(part.copied, part.kept_vertex[part.original_to_repaired], np.arange(part.original.V))
+    return replace(found, index=found.index[rows], face=found.face[rows], barycentric=found.barycentric[rows])
 
 
 def _partial(fit: Fit | ImplicitFit) -> bool:

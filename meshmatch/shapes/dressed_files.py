@@ -216,10 +216,8 @@ def warn_about_losses(file: Path | None, path: Path, kept: bool = True, own_mate
         files = [] if file.parent.resolve() == folder else find_companions(file)[0]
         copies = {each: folder / each.resolve().relative_to(file.parent.resolve()) for each in files}
         if missing := [each.name for each, copy in copies.items() if not copy.exists()]:
-            warn(
-                f"{path.name} refers to {', '.join(missing)[:200]}, beside {file.name} but not beside it: copy the files"
-            )
-    after = ".glb" if blender.is_converted(path) else after  # Blender writes these through a glb
+            names = ", ".join(missing)[:200]
+            warn(f"{path.name} refers to {names}, which is not in its folder: copy it from that of {file.name}")
     if (
         file is None
         or not file.is_file()

@@ -78,7 +78,7 @@ def test_files_that_the_output_names_but_lacks_are_told(run: Run, pair: Path, su
     Path("skin.png").write_bytes(b"an image")
     named = "skin.png" if suffix == "ply" else "b.mtl, skin.png"
     command = ["transfer-color", "a.ply", f"b.{suffix}", "--map", "ab.npz", "-o"]
-    told = f"warning: out.{suffix} refers to {named}, beside b.{suffix} but not beside it: copy the files\n"
+    told = f"warning: out.{suffix} refers to {named}, which is not in its folder: copy it from that of b.{suffix}\n"
     assert told in well(run(*command, f"far/out.{suffix}")).err
     assert "refers to" not in well(run(*command, f"out.{suffix}")).err
 

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from meshmatch.api import results
+from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.shapes.copies import counterparts
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
+from tests.conftest import some_fit
 from tests.transfer.rigs import tube
 
 TURN = Rotation.from_euler("xyz", (20, 50, 70), degrees=True).as_matrix()
@@ -54,3 +57,21 @@ def test_counterparts_stand_for_what_was_left_out() -> None:
     assert clean.copied is not None and np.array_equal(clean.copied, lost(shape, 1))
     np.testing.assert_array_equal(clean.original_to_repaired[V:], clean.original_to_repaired[:V])
     assert f"{V:,} vertices of copies elsewhere in the scene, matched like their originals" in clean.notes
+
+
+def test_copies_have_the_images_of_their_original(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Folds are removed from the image of the one that was fitted, and its copies follow."""
+    shape, one = scene(np.eye(3), TURN), tube()
+    V = one.V
+    clean = repair(Shape(shape.verts, shape.faces, weights=1.0 * ~lost(shape, 1), meshes=shape.meshes))
+    unfolded = np.random.default_rng(0).permutation(V)
+
+    def unfold_pair(found: VertexMap, *_: object) -> tuple[VertexMap, VertexMap]:
+        changed = VertexMap.between(shape, one, np.append(unfolded, found.index[V:]))
+        return changed, VertexMap.between(one, shape, np.arange(V))
+
+    monkeypatch.setattr(results, "unfold_pair", unfold_pair)
+    fits = tuple(some_fit(one.verts, one.faces, repaired=part) for part in (clean, repair(one)))
+    found, back = results.maps_of_fits(fits, fits, 1)
+    np.testing.assert_array_equal(found.index, [*unfolded, *unfolded])
+    assert back is not None and np.array_equal(back.index, np.arange(V))
