@@ -21,6 +21,7 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.maps.files import load_map
 from meshmatch.maps.vertex_map import VertexMap
 from meshmatch.scalars import is_integer
+from meshmatch.shapes.alignment import sqrt_area_frame
 from meshmatch.shapes.appearance import Appearance
 from meshmatch.shapes.colors import linear_to_srgb_alpha, srgb_to_linear_alpha
 from meshmatch.shapes.dressed_files import warn_about_losses
@@ -121,7 +122,12 @@ def have_same_faces(source: Shape, target: Shape) -> bool:
 
 
 def vertex_to_vertex(source: Shape, target: Shape) -> MapPair:
-    """Identity maps between two poses of one mesh. They are not judged: their verdict is "unknown"."""
+    """Identity maps between two poses of one mesh. They are not judged: their verdict is "unknown".
+
+    `InputError` if one of them has no area.
+    """
+    for shape in (source, target):
+        sqrt_area_frame(shape)
     there, back = (VertexMap.between(a, b, np.arange(a.V)) for a, b in ((source, target), (target, source)))
     return MapPair(source, target, there, opposite=back)
 

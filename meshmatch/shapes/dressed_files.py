@@ -218,6 +218,7 @@ def warn_about_losses(file: Path | None, path: Path, kept: bool = True, own_mate
         if missing := [each.name for each, copy in copies.items() if not copy.exists()]:
             names = ", ".join(missing)[:200]
             warn(f"{path.name} refers to {names}, which is not in its folder: copy it from that of {file.name}")
+    after = ".glb" if blender.is_converted(path) else after  # Blender writes these through a glb
     if (
         file is None
         or not file.is_file()

@@ -50,6 +50,13 @@ def test_two_poses_of_a_mesh_need_no_match(pair: tuple[Shape, Shape, VertexMap])
         assert found.verdict == "unknown" and np.isnan(found.confidence).all()
     values = np.arange(float(sphere.V))
     np.testing.assert_array_equal(meshmatch.transfer_values(sphere, other, values).data, values)
+    for collapsed in (np.ones_like(sphere.verts), sphere.verts * [1, 0, 0]):  # to a point, to a line
+        for pair in (
+            (sphere, Shape(collapsed, sphere.faces, "flat")),
+            (Shape(collapsed, sphere.faces, "flat"), sphere),
+        ):
+            with pytest.raises(InputError, match="flat has no surface area"):
+                meshmatch.find_maps(*pair)
     assert not have_same_faces(sphere, Shape(other.verts, np.roll(other.faces, 1, axis=1)))
     assert not have_same_faces(Shape(sphere.verts, sphere.faces[:0]), Shape(other.verts, other.faces[:0]))
 
