@@ -41,7 +41,9 @@ def _numbered_forms(word: str, between: str) -> Iterator[str]:
 
 
 def as_path(path: str | Path) -> Path:
-    """Convert to a path; `InputError` for anything but text or a path, such as None."""
+    """Convert to a path; `InputError` for anything but text or a path, such as None, and for empty text."""
+    if path == "":
+        raise InputError("a path is empty", "name a file or folder; . is the current folder")
     try:
         return Path(path)
     except TypeError as error:

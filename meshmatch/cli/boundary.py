@@ -8,6 +8,7 @@ permission), 2 a wrong command line, 130 interrupted, 143 killed by SIGTERM, 129
 import errno
 import os
 import signal
+import sys
 import threading
 import time
 import warnings
@@ -16,12 +17,13 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from meshmatch.cli.user_messages import Console, stdout_error
-from meshmatch.errors import MeshmatchError, MeshmatchWarning
+from meshmatch.errors import MeshmatchError, MeshmatchWarning, OptionError
 
 DEBUG_VARIABLE = "MESHMATCH_DEBUG"
 INTERRUPTED = 130
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _DEFAULT_HANDLERS = (signal.SIG_DFL, signal.default_int_handler)
+_MAY_BE_EMPTY = ("--blank", "--title", "--name")  # options whose text may be empty
 _SAME_SIGNAL = 1.0  # seconds within which a second signal is ignored: `timeout` sends two
 
 
@@ -102,12 +104,22 @@ def _kills_as_interrupts() -> Iterator["_Killed"]:
             signal.signal(number, handler)
 
 
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Raise `OptionError` for an empty argument: as a path it would mean the current folder."""
+    for before, word in zip(["meshmatch", *words], words, strict=False):
+        is_empty = word == "" or (word.startswith("--") and word.endswith("="))
+        if is_empty and (word[:-1] or before) not in _MAY_BE_EMPTY:
+            what = f"{word[:-1]} is empty" if word else f"the argument after {before} is empty"
+            raise OptionError(what, "is it a variable that is not set?")
+
+
 def _run(arguments: Sequence[str] | None) -> int:
     from typer.main import get_command
 
     from meshmatch.cli.app import app
     from meshmatch.threads import set_threads
 
+    _refuse_empty(sys.argv[1:] if arguments is None else arguments)
     set_threads(1)  # before NumPy reads it; commands raise it where they need more
     try:
         with _warnings_as_messages():

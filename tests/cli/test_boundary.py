@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+import meshmatch
 from meshmatch import __version__
 from meshmatch.cli import main
 from meshmatch.errors import InputError, MeshmatchWarning
 from meshmatch.shapes.files import load_shape
-from tests.cli.conftest import Run
+from tests.cli.conftest import Run, refused
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -51,6 +52,25 @@ def test_a_wrong_command_line_is_2(run: Run, words: list[str]) -> None:
     assert answer.status == 2
     assert answer.out == ""
     assert "Error: " in answer.err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["match", "", "b.ply", "-o", "x.npz"], "the argument after match is empty"),
+        (["match", "a.ply", "b.ply", "-o", ""], "the argument after -o is empty"),
+        (["fit", "", "-o", "fits"], "the argument after fit is empty"),
+        (["info", "--picture=", "a.ply"], "--picture is empty"),
+    ],
+)
+def test_an_empty_argument_is_not_the_current_folder(
+    run: Run, words: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(run(*words), told, tmp_path, set())
+    for call in (meshmatch.load_shape, meshmatch.Collection):
+        with pytest.raises(InputError, match="a path is empty"):
+            call("")
 
 
 def test_a_word_that_is_none_of_the_choices(run: Run) -> None:
