@@ -35,6 +35,13 @@ def _check_table(table: Path) -> None:
     check_suffix(table, (".csv",), "a table of measurements")
 
 
+def _check_points(given: Mapping[str, Any]) -> None:
+    """Check that SRC has the landmarks of all measurements."""
+    from meshmatch.api.measure import measuring_points
+
+    measuring_points(given["source"], given["measurements"], given["landmarks"])
+
+
 def _table(table: Path, given: Mapping[str, Any], source: str, written: Mapping[str, Path]) -> str:
     """Write the measurements of all targets, and of SRC unless it is the included body, as one table."""
     import numpy as np
@@ -67,7 +74,7 @@ def _cell(value: float) -> float | str:
 
 
 @grouped
-@to_targets("measure", Gather(_check_table, _table))
+@to_targets("measure", Gather(_check_table, _table), _check_points)
 def measure(
     *,
     source: _Source,

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from meshmatch.collections.transfer_table import TransferRecord
 
 Verb = Callable[..., Json]
+Check = Callable[[Mapping[str, Any]], object]
+"""Checks the command's arguments before the work, for errors that every target would have."""
 
 
 class Gather(NamedTuple):
@@ -42,18 +44,20 @@ _SEVERAL = (
 )
 
 
-def to_targets(transfer: str, gather: Gather | None = None) -> Callable[[Verb], Callable[..., None]]:
+def to_targets(
+    transfer: str, gather: Gather | None = None, check: Check | None = None
+) -> Callable[[Verb], Callable[..., None]]:
     """Let a command for one target, which returns its record for --json, accept several targets.
 
     ``transfer`` is the name of the function of `meshmatch` that the command calls; ``gather`` writes the table of its option
-    ``table``.
+    ``table``; ``check`` is called once, before the work.
     """
 
     def wrapped(verb: Verb) -> Callable[..., None]:
         @wraps(verb)
         def called(*, target: list[Path], ending: str | None, **rest: Any) -> None:
             if _is_several(target):
-                _transfer_all(verb, transfer, target, ending, rest, gather)
+                _transfer_all(verb, transfer, target, ending, rest, gather, check)
                 return
             if ending is not None:
                 raise OptionError(
@@ -88,7 +92,13 @@ def _is_several(target: Sequence[Path]) -> bool:
 
 
 def _transfer_all(
-    verb: Verb, transfer: str, target: Sequence[Path], ending: str | None, rest: dict[str, Any], gather: Gather | None
+    verb: Verb,
+    transfer: str,
+    target: Sequence[Path],
+    ending: str | None,
+    rest: dict[str, Any],
+    gather: Gather | None,
+    check: Check | None,
 ) -> None:
     """Transfer to each target and print a row for each; raise in the end if a transfer failed."""
     from meshmatch.collections.setting import FAILED
@@ -116,6 +126,8 @@ def _transfer_all(
     endings = choose_suffix(transfer, ending, garment, found.files, rest.get("join", False))
     if maps.map is None:
         check_model(maps.model)
+    if check is not None:
+        check(rest)
     console = Console(run.quiet)
     rest |= {"maps": maps, "run": _changed(run, json=False, quiet=True)}
     how = {name: value for name, value in rest.items() if name not in ("run", "output", "picture")}

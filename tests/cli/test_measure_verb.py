@@ -58,6 +58,14 @@ def test_a_single_measurement_is_in_the_singular(run: Run, copies: Shape) -> Non
     assert "wrote all.csv: 1 measurement of 1 shape\n" in answer.err
 
 
+def test_a_name_that_no_landmark_has_fails_once(run: Run, copies: Shape) -> None:
+    Path("own.csv").write_text(OWN.replace("crotch", "crotsch"))
+    answer = run("measure", "body", "in", "-o", "out", "--measurements", "own.csv")
+    assert answer.status == 1
+    assert answer.err == "error: measurement legs: no landmark is called 'crotsch'\nhint: did you mean 'crotch'?\n"
+    assert not Path("out").exists()
+
+
 def test_all_are_one_table_whose_units_are_told(run: Run, copies: Shape) -> None:
     Path("own.csv").write_text(f"{OWN}none,distance,crown,crown\n")
     words = ("measure", "body", "in", "-o", "out", "--measurements", "own.csv", "--table", "all.csv")
