@@ -4,6 +4,7 @@ docs/formats.md describes the files.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -48,6 +49,7 @@ check_landmarks_suffix = partial(tables.check_suffix, suffixes=LANDMARK_SUFFIXES
 check_table_suffix = partial(
     tables.check_suffix, suffixes=(".csv", ".tps", ".txt", ".npz"), what="a table of landmarks"
 )
+_MAX_LISTED = 5  # names in a message
 _HINT = "a row each: name,vertex or name,x,y,z; MeshLab's .pp, 3D Slicer's .mrk.json or .fcsv, .pts, .tps, .json"
 
 
@@ -205,10 +207,14 @@ def load_landmarks(path: str | Path, shape: Shape, space: Space = "") -> tuple[L
 
 
 def landmarks_with_warnings(path: str | Path, shape: Shape, space: Space = "") -> Landmarks:
-    """As `load_landmarks`, with warnings about landmarks that are missing, converted, or far from the surface."""
+    """As `load_landmarks`, with warnings about landmarks that are missing, converted, or far from the surface, and about
+    names of several landmarks.
+    """
     landmarks, furthest = load_landmarks(path, shape, space)
     for note in landmarks.notes:
         warn(note)
+    if repeated := _repeated_names(landmarks.names):
+        warn(f"{Path(path).name} has several landmarks of one name: {_listed(repeated)}")
     warn_if_far(shape, furthest)
     return landmarks
 
@@ -223,11 +229,13 @@ def known_pairs(
     """
     read = [landmarks_with_warnings(*each) for each in zip(files, shapes, spaces, strict=True)]
     rows = [{name: row for row, name in enumerate(each.names)} for each in read]
+    if repeated := {name for each in read for name in _repeated_names(each.names)}:
+        warn(f"names of several landmarks are left out: {_listed(sorted(repeated))}")
+        rows = [{name: row for name, row in each.items() if name not in repeated} for each in rows]
     if both := [name for name in rows[0] if name in rows[1]]:
         for k in range(2):
             if unmatched := [name for name in rows[k] if name not in rows[1 - k]]:
-                listed = ", ".join(unmatched[:5]) + ", ..." * (len(unmatched) > 5)
-                warn(f"{files[k].name}: {files[1 - k].name} has no {listed}: left out")
+                warn(f"{files[k].name}: {files[1 - k].name} has no {_listed(unmatched)}: left out")
         first, second = (each.vertex[[row[name] for name in both]] for each, row in zip(read, rows, strict=True))
         return first, second
     if len(read[0].names) != len(read[1].names):
@@ -235,6 +243,15 @@ def known_pairs(
         raise InputError(f"no landmark is in both files by its name: {counts}", "give the same names in both")
     warn(f"{files[0].name} and {files[1].name} have no name in common: their landmarks are paired in order")
     return read[0].vertex, read[1].vertex
+
+
+def _repeated_names(names: Sequence[str]) -> list[str]:
+    """Names that occur more than once."""
+    return [name for name, count in Counter(names).items() if count > 1]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_MAX_LISTED]) + ", ..." * (len(names) > _MAX_LISTED)
 
 
 def warn_if_far(shape: Shape, furthest: float) -> None:

@@ -100,6 +100,16 @@ def test_colors_of_a_finer_copy(run: Run, pair: Path, out: str) -> None:
     assert "used the map ab.npz from a.ply to b.ply" in answer.err
 
 
+def test_landmarks_of_one_name_are_all_kept_and_told(run: Run, pair: Path) -> None:
+    Path("marks.csv").write_text("name,vertex\nnose,3\nchin,7\nnose,9\n")
+    answer = well(run(*call("landmarks")))
+    assert "warning: marks.csv has several landmarks of one name: nose\n" in answer.err
+    found, _ = load_landmarks("out.csv", load_shape("b.ply"))
+    assert (found.names, found.vertex.tolist()) == (("nose", "chin", "nose"), [3, 7, 9])
+    answer = well(run("evaluate", "ab.npz", "a.ply", "b.ply", "--points", "marks.csv", "out.csv", "--json"))
+    assert answer.record["points"] == 1 and "warning: names of several landmarks are left out: nose\n" in answer.err
+
+
 def test_two_poses_of_a_mesh_are_told(run: Run, pair: Path) -> None:
     save_shape("posed.ply", replace(load_shape("a.ply"), verts=2.0 * load_shape("a.ply").verts + 1.0))
     answer = well(run("transfer-color", "a.ply", "posed.ply", "--values", "values.npy", "-o", "v.npy"))
