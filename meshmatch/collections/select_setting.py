@@ -13,7 +13,7 @@ import numpy as np
 
 from meshmatch.api.inputs import as_model, check_config, repair_allowing_parts, repair_or_raise
 from meshmatch.api.kinds import choose_model
-from meshmatch.collections.setting import FIRST_TEMPLATE, TEMPLATE, Setting, Source
+from meshmatch.collections.setting import FIRST_TEMPLATE, TEMPLATE, Setting, Source, read_template
 from meshmatch.collections.stores import Store
 from meshmatch.errors import InputError, MeshmatchError, OptionError
 from meshmatch.fitting.kind_templates import mean_shape, template_of, with_final_nodes
@@ -25,7 +25,7 @@ from meshmatch.shapes.input_files import read_json
 from meshmatch.shapes.rims import is_sheet
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.prepared_folder import medoid
-from meshmatch.templates.template import Template, load_template, save_template
+from meshmatch.templates.template import Template, save_template
 
 SCHEMA = 1
 MANIFEST = "collection.json"
@@ -79,8 +79,7 @@ def _describe_difference(name: str, before: Mapping[str, Any], now: Mapping[str,
 def _first_template(requested: Setting, sources: Sequence[Source], new: bool) -> Template:
     """Make a template of the medoid of some shapes, for fits without a model; an existing collection's one is read."""
     if not new:
-        with requested.store.reading(FIRST_TEMPLATE) as path:
-            return load_template(path)
+        return read_template(requested.store, FIRST_TEMPLATE)
     some = np.unique(np.linspace(0, len(sources) - 1, min(len(sources), _MAX_CANDIDATES)).astype(int))
     found = []
     for number in some:

@@ -13,7 +13,7 @@ from typing import Any
 from meshmatch.api.inputs import as_model, repair_or_raise
 from meshmatch.api.matcher import Matcher
 from meshmatch.collections.stores import Store
-from meshmatch.errors import InputError
+from meshmatch.errors import InputError, TemplateError
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.fitting.fitter import may_be_part
@@ -219,14 +219,21 @@ class Setting:
 
 
 def read_template(store: Store, file: str = TEMPLATE) -> Template:
-    """Read a template of a collection, once per process, and again if its file has changed."""
+    """Read a template of a collection, once per process, and again if its file has changed.
+
+    `TemplateError` if it is missing or damaged.
+    """
     return _template(store, file, store.mtime_ns(file))
 
 
 @lru_cache(maxsize=4)
 def _template(store: Store, file: str, mtime_ns: int) -> Template:
     with store.reading(file) as path:
-        return load_template(path)
+        try:
+            return load_template(path)
+        except TemplateError as error:
+            problem = f"the template of these fits, {store.location}/{file}, cannot be read: {error.message}"
+            raise TemplateError(problem, "remove the folder, and fit again") from error
 
 
 def read_finished_fit(store: Store, name: str) -> PlacedFit:

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 import meshmatch
 from meshmatch.cli import main
 from meshmatch.collections.fit_all import file_table
-from meshmatch.collections.setting import Record
+from meshmatch.collections.setting import Record, clear_caches
 from meshmatch.collections.sources import find_sources
 from meshmatch.collections.stores import Store
-from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, OutputError
+from meshmatch.errors import InputError, MeshmatchError, MeshmatchWarning, OptionError, OutputError, TemplateError
 from meshmatch.experiments.hostile.learned import write_eggs
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fitter import Fitter
@@ -262,6 +262,14 @@ def test_damaged_fits_are_refused(made: tuple[Path, tuple[Record, ...]], tmp_pat
         (about / "collection.json").write_text(text)
         with pytest.raises(InputError, match=r"damaged|schema 2"):
             meshmatch.Collection(about).names  # noqa: B018
+    whole_template = (made[0] / "template.safetensors").read_bytes()
+    shutil.copytree(made[0], tmp_path / "copy")
+    for data in (b"", whole_template[:1000], whole_template[:-1] + bytes([whole_template[-1] ^ 1])):
+        (tmp_path / "copy" / "template.safetensors").write_bytes(data)
+        clear_caches()
+        with pytest.raises(TemplateError, match=r"of these fits, .*copy/template\.safetensors, cannot") as found:
+            meshmatch.Collection(tmp_path / "copy").map("dancer", "climber")
+        assert found.value.hint == "remove the folder, and fit again"
     size = 8 + int.from_bytes(whole[:8], "little")
     header = json.loads(whole[8:size])
     about_fit = json.loads(header["__metadata__"]["fit"])
