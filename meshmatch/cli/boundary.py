@@ -23,7 +23,7 @@ DEBUG_VARIABLE = "MESHMATCH_DEBUG"
 INTERRUPTED = 130
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _DEFAULT_HANDLERS = (signal.SIG_DFL, signal.default_int_handler)
-_MAY_BE_EMPTY = ("--blank", "--title", "--name")  # options whose text may be empty
+_MAY_BE_EMPTY = ("--blank", "--title", "--name", "--format")  # texts that are checked by their commands
 _SAME_SIGNAL = 1.0  # seconds within which a second signal is ignored: `timeout` sends two
 
 
