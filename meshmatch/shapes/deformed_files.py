@@ -22,7 +22,7 @@ from meshmatch.shapes.appearance import Appearance, BakedMaterial
 from meshmatch.shapes.colors import linear_to_bytes
 from meshmatch.shapes.dressed_files import Dressed, content_beyond_triangles, find_companions
 from meshmatch.shapes.files import check_suffix, load_shape, save_shape
-from meshmatch.shapes.formats import gltf, obj_text
+from meshmatch.shapes.formats import COORDINATES, gltf, obj_text
 from meshmatch.shapes.formats.gltf_add_skeleton import with_skeleton
 from meshmatch.shapes.formats.gltf_edit import Editor, record_source_mesh
 from meshmatch.shapes.formats.gltf_join import add_scene
@@ -333,7 +333,8 @@ def _describe_lost(original: Path | None, look: Appearance | None, textured: boo
     if look is not None and not textured and (look.textured or len(look.materials) > 1):
         lost += ["the materials"] if laid_out else ["the texture coordinates", "the materials"]
     if suffix not in gltf.SUFFIXES:
-        lost += [f"the {word}" for word in content_beyond_triangles(original)]
+        beyond = content_beyond_triangles(original)
+        lost += [f"the {word}" for word in beyond if word != COORDINATES or not (textured or laid_out)]
     else:
         lost += ["other maps than the base color", "skins", "morph targets", "the nodes"]
     lost = list(dict.fromkeys(lost))

@@ -15,6 +15,7 @@ from meshmatch.outputs import replace_all_on_success
 from meshmatch.shapes.appearance import BakedMaterial, Pixels, png_bytes
 from meshmatch.shapes.files import save_shape
 from meshmatch.shapes.formats import (
+    COORDINATES,
     TexturedMesh,
     gltf,
     gltf_write,
@@ -231,7 +232,7 @@ def warn_about_losses(file: Path | None, path: Path, kept: bool = True, own_mate
     elif after == ".glb" and before in gltf.SUFFIXES:
         lost = []
     else:
-        lost = content_beyond_triangles(file)
+        lost = [word for word in content_beyond_triangles(file) if word != COORDINATES or not own_materials]
     if lost:
         listed = f"{', '.join(lost[:-1])} and {lost[-1]}" if lost[1:] else lost[0]
         warn(f"{path.name} does not have the {listed} of {file.name}")

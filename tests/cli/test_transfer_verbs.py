@@ -12,7 +12,9 @@ import pytest
 
 from meshmatch.maps.files import save_map
 from meshmatch.maps.vertex_map import VertexMap
+from meshmatch.shapes.dressed_files import save_textured
 from meshmatch.shapes.files import load_shape, save_shape
+from meshmatch.shapes.formats import TexturedMesh
 from meshmatch.shapes.formats.vtk import write_vtp
 from meshmatch.shapes.formats.vtk_xml import point_arrays
 from meshmatch.shapes.shape import Shape
@@ -64,6 +66,25 @@ def test_a_vtp_keeps_its_arrays(run: Run, pair: Path) -> None:
         well(run(f"transfer-{noun}", "a.ply", "b.vtp", "-o", f"{noun}.vtp", *options, "--map", "ab.npz"))
     assert list(point_arrays(Path("color.vtp"))) == ["thickness", "height"]
     assert list(point_arrays(Path("labels.vtp"))) == ["thickness", "label"]
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+def test_texture_coordinates_that_another_format_loses_are_told(run: Run, pair: Path, suffix: str) -> None:
+    ball, name = load_shape("b.ply"), f"laid.{suffix}"
+    if suffix == "ply":
+        lines = [f"{x} {y} {z} {x} {y}" for x, y, z in ball.verts.tolist()]
+        lines += [f"3 {a} {b} {c}" for a, b, c in ball.faces.tolist()]
+        head = [f"property double {each}" for each in ("x", "y", "z", "s", "t")]
+        head = ["ply", "format ascii 1.0", f"element vertex {ball.V}", *head, f"element face {ball.F}"]
+        Path(name).write_text("\n".join([*head, "property list uchar int vertex_indices", "end_header", *lines]))
+    else:
+        mesh = TexturedMesh(ball.verts, ball.faces, ball.verts[ball.faces][..., :2])
+        save_textured(name, mesh, np.full((4, 4, 4), 255, np.uint8))
+    save_map("laid.npz", VertexMap.between(load_shape("a.ply"), load_shape(name), np.zeros(load_shape("a.ply").V, int)))
+    for out in ("out.glb", "out.obj", "out.ply", "out.off"):
+        answer = well(run("transfer-color", "a.ply", name, "--map", "laid.npz", "-o", out))
+        told = "texture coordinates" in answer.err and f"of {name}" in answer.err
+        assert told == (out.rpartition(".")[2] != suffix), answer.err
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj"])

@@ -30,6 +30,8 @@ from meshmatch.shapes.colors import linear_to_srgb_alpha, srgb_to_linear_alpha
 
 NO_FACES = np.empty((0, 3), np.int64)
 NO_MESH = "is it a mesh or a point cloud at all?"
+COORDINATES = "texture coordinates"
+"""Name of texture coordinates in lists of what a file contains."""
 WRONG_SUFFIX = "does the suffix fit the content?"
 MAX_ELEMENTS = 40_000_000
 """Maximum number of vertices and faces, together, in one file: more than any method here can process."""

@@ -26,6 +26,7 @@ from meshmatch.outputs import plain_text
 from meshmatch.shapes.colors import to_srgb
 from meshmatch.shapes.companions import find_companion
 from meshmatch.shapes.formats import (
+    COORDINATES,
     NO_FACES,
     WRONG_SUFFIX,
     Raw,
@@ -259,6 +260,7 @@ class Document:
         present = {
             "nodes": len(self.nodes) > 1,
             "materials": len(self.json.get("materials", [])) > 1,
+            COORDINATES: any("TEXCOORD_0" in part.get("attributes", {}) for part in parts),
             "normals": any("NORMAL" in part.get("attributes", {}) for part in parts),
             "skins": bool(self.json.get("skins")),
             "clips": bool(self.json.get("animations")),

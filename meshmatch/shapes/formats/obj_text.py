@@ -15,7 +15,14 @@ import numpy as np
 from meshmatch.arrays import Float, Floats, Int, Ints
 from meshmatch.errors import InputError
 from meshmatch.geometry.triangles import normalized
-from meshmatch.shapes.formats import columns, lines_starting_with, parse_numbers, without_comments, words_per_line
+from meshmatch.shapes.formats import (
+    COORDINATES,
+    columns,
+    lines_starting_with,
+    parse_numbers,
+    without_comments,
+    words_per_line,
+)
 from meshmatch.shapes.formats.obj import (
     SPACED_SLASH,
     entries_and_faces,
@@ -157,11 +164,12 @@ def content_beyond_triangles(name: str, data: bytes) -> list[str]:
     """Kinds of content besides the triangles of one mesh with one material, in words ("polygons", "groups", ...)."""
     data = join_lines(data)
     normals, _, sizes = entries_and_faces(name, data, b"vn")[1:4]
-    groups, objects, materials = lines_starting_with(without_comments(data), b"g", b"o", b"usemtl")
+    groups, objects, materials, uv = lines_starting_with(without_comments(data), b"g", b"o", b"usemtl", b"vt")
     present = {
         "polygons": bool(len(sizes)) and int(sizes.max()) > 3,
         "groups": len(groups[1]) + len(objects[1]) > 1,
         "materials": len({name.strip() for name in materials[0].split(b"\n")} - {b""}) > 1,
+        COORDINATES: len(uv[1]) > 0,
         "normals": len(normals) > 0,
     }
     return [word for word, is_present in present.items() if is_present]

@@ -134,6 +134,12 @@ def _image_indices(values: Floats | Ints) -> Ints:
     return np.where(np.abs(values) < 2**31, np.nan_to_num(values, posinf=0.0, neginf=0.0), -1).astype(np.int64)
 
 
+def has_coordinates(content: Content) -> bool:
+    """Whether vertices, or corners of faces, have texture coordinates under a known name."""
+    lists = (p.name for face in content.faces for p in face.properties if p.count_kind)
+    return _vertex_uv(content.vertices) is not None or any(_normalized(each) in _UV_LISTS for each in lists)
+
+
 def _vertex_uv(element: Element) -> Floats | None:
     """(V, 2) texture coordinates of the vertices, v up; None if there are none."""
     known: dict[str, dict[str, str]] = {}  # property name, by prefix and axis

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from meshmatch.arrays import Float, Floats, Ints
 from meshmatch.errors import warn
-from meshmatch.shapes.formats import concatenated_ranges, damaged
+from meshmatch.shapes.formats import COORDINATES, concatenated_ranges, damaged, ply_appearance
 from meshmatch.shapes.formats.ply import CHANNELS, END, KINDS, Columns, Content, color_properties, corners_of, parsed
 from meshmatch.shapes.formats.ply_rows import TYPES, Element, Property
 from meshmatch.shapes.formats.polygons import majority_of_triangles
@@ -84,7 +84,8 @@ class PlyFile:
             polygons |= bool((corners_of(self.name, element)[1] > 3).any())
         colors = {p.name for element in (content.vertices, *content.faces) for p in color_properties(element)}
         others = [each for each in dict.fromkeys(names) if each not in colors | _SURFACE_PROPERTIES]
-        return ["polygons"] * polygons + [f"property {each}" for each in others]
+        coordinates = [COORDINATES] * ply_appearance.has_coordinates(content)
+        return ["polygons"] * polygons + coordinates + [f"property {each}" for each in others]
 
     def with_positions(self, verts: Float[Floats, "V 3"], turns: Float[Floats, "V 3 3"]) -> bytes:
         """Return its bytes with new vertex positions, and normals rotated by the rotation at each vertex."""
