@@ -116,7 +116,8 @@ def composed(
         if len(shapes) != 2:
             raise OptionError(f"a map is of two shapes, not of {len(shapes)}", "give the source, then the target")
         maps = find_maps(shapes[0], shapes[1], match)
-        return compose.compose_match(shapes[0], shapes[1], maps.forward, maps.rotations, look)
+        fitted = maps.match.shapes if maps.match is not None else None
+        return compose.compose_match(*(fitted or (shapes[0], shapes[1])), maps.forward, maps.rotations, look)
     if values is not None:
         tables = []
         for numbers, shape in zip(values, shapes, strict=True):

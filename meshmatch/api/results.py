@@ -132,10 +132,15 @@ class MatchResult:
     def _repr_html_(self) -> str:
         from meshmatch.api.notebook import map_html
 
-        repaired = [getattr(fit, "repaired", None) for fit in (self.source_fit, self.target_fit)]
-        shapes = (repaired[0].original, repaired[1].original) if repaired[0] and repaired[1] else None
+        shapes = self.shapes
         more = {"time": f"{self.seconds:.1f} s", "notes": "; ".join(self.notes)}
         return map_html("Match", self.map, shapes, self.rotations, more)
+
+    @property
+    def shapes(self) -> tuple[Shape, Shape] | None:
+        """Source and target, with weight 0 where a fit left something out; None if the fits do not contain them."""
+        repaired = [getattr(fit, "repaired", None) for fit in (self.source_fit, self.target_fit)]
+        return (repaired[0].original, repaired[1].original) if repaired[0] and repaired[1] else None
 
     @property
     def rotations(self) -> tuple[Floats | None, Floats | None]:

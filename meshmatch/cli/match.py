@@ -54,7 +54,8 @@ def match(
     if picture is not None:
         from meshmatch.render.compose import compose_match
 
-        compose_match(a, b, found, result.rotations).named(names).render(picture)
+        shown = compose_match(*(result.shapes or (a, b)), found, result.rotations).named(names)
+        shown.render(picture)
     user_messages.report_match(console, result, names)
     user_messages.report_verdict(console, found.verdict, found.reasons, "the map")
     console.say(
@@ -62,7 +63,7 @@ def match(
         f"its vertex of {names[1]} ({result.seconds:.1f} s)"
     )
     if picture is not None:
-        console.say(f"drew {picture}: corresponding points in the same color")
+        console.say(f"drew {picture}: {shown.caption}")
     if run.json:
         fits = [
             user_messages.fit_record(*each) for each in zip(names, (result.source_fit, result.target_fit), strict=True)

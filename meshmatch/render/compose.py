@@ -86,13 +86,23 @@ def compose_match(
 ) -> Composition:
     """The source colored by position, and the target with these colors transferred by the map; unmatched parts are grey.
 
-    `InputError` for a map that is not of these shapes.
+    What fits ignore (weight 0), such as a floor, is not drawn. `InputError` for a map that is not of these shapes.
     """
-    turns = rotations_to_same_side(source, target, vertex_map, rotations, look.up, look.front)
-    here = position_colors(source, turns[0])
-    there = matched_colors(here, vertex_map, invert_map(vertex_map, source, target), source)
-    panels = _colored_panels((source, target), (here, there))
-    return Composition(panels, caption="corresponding points in the same color").rotated(turns)
+    back = invert_map(vertex_map, source, target)
+    drawn = _without_ignored(source), _without_ignored(target)
+    turns = rotations_to_same_side(*drawn, vertex_map, rotations, look.up, look.front)
+    here = position_colors(drawn[0], turns[0])
+    panels = _colored_panels(drawn, (here, matched_colors(here, vertex_map, back, source)))
+    caption = "corresponding points in the same color"
+    caption += "" if drawn == (source, target) else ", without what was left out"
+    return Composition(panels, caption=caption).rotated(turns)
+
+
+def _without_ignored(shape: Shape) -> Shape:
+    """The shape without vertices of weight 0, and their faces; vertices keep their numbers."""
+    if shape.weights is None or shape.weights.all() or not shape.weights.any():
+        return shape
+    return replace(shape, invalid=~shape.valid | (shape.weights == 0))
 
 
 def _colored_panels(shapes: Sequence[Shape], colors: Iterable[Float[Floats, "V C"]]) -> tuple[Panel, ...]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ from PIL import Image
 import meshmatch
 from meshmatch.api import matcher, matching
 from meshmatch.errors import OutputError
+from meshmatch.fitting.fit import Fit
 from meshmatch.maps.files import load_map
 from meshmatch.models.trained import TrainedModel
 from meshmatch.shapes.files import load_shape, save_shape
 from meshmatch.shapes.formats.gltf import Document
+from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from meshmatch.templates.template import Template
 from tests.cli.conftest import FakeMatching, Run, fake_fit
@@ -75,6 +78,17 @@ def test_match_draws_a_picture(run: Run, two: tuple[Path, Path], stub: FakeMatch
         assert image.size[0] > 1.3 * image.size[1]  # side by side
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 1000  # and in colors
     assert output.exists()
+
+
+def test_the_picture_lacks_what_a_fit_left_out(run: Run, two: tuple[Path, Path], stub: FakeMatching) -> None:
+    def fit_of_upper_half(shape: Shape, *args: Any) -> Fit:
+        upper = replace(shape, weights=shape.verts[:, 1] > np.median(shape.verts[:, 1]))
+        return replace(fake_fit(shape, *args), repaired=repair(upper))
+
+    stub.make_fit = fit_of_upper_half
+    picture = two[0].with_name("both.png")
+    answer = run("match", *two, "-o", two[0].with_name("map.npy"), "--picture", picture)
+    assert f"drew {picture}: corresponding points in the same color, without what was left out" in answer.err
 
 
 def test_a_real_ctrl_c_in_the_long_work(run: Run, two: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:

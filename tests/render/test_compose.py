@@ -86,6 +86,25 @@ def test_both_shapes_are_seen_from_the_same_side(torus: Shape) -> None:
     assert all(np.array_equal(panel.rotation, turn) for panel, turn in zip(kept, given, strict=True))
 
 
+@pytest.mark.parametrize("cloud", [False, True])
+def test_what_fits_ignore_is_not_drawn(sphere: Shape, cloud: bool) -> None:
+    """A floor may hide the body, and is so large that the body gets few of the colors."""
+    size = 20 * sphere.diagonal
+    floor = np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * size
+    verts = np.concatenate([sphere.verts, floor])
+    faces = np.concatenate([sphere.faces, sphere.V + np.array([[0, 1, 2], [0, 2, 3]])])
+    on_floor = Shape(verts, faces[:0] if cloud else faces, weights=np.arange(len(verts)) < sphere.V)
+    index = np.arange(on_floor.V) % sphere.V
+    shown = compose_match(on_floor, sphere, VertexMap.between(on_floor, sphere, index))
+    drawn, other = shown.panels
+    assert shown.caption == "corresponding points in the same color, without what was left out"
+    assert drawn.shape.diagonal == pytest.approx(sphere.diagonal) and drawn.shape.V == on_floor.V
+    colors = position_colors(sphere, np.asarray(drawn.rotation))
+    assert np.asarray(drawn.colors)[: sphere.V] == pytest.approx(colors)
+    assert compose_match(sphere, sphere, VertexMap.identity(sphere)).caption == "corresponding points in the same color"
+    assert other.shape is sphere
+
+
 def test_doubt_is_dark(sphere: Shape) -> None:
     confidence = np.where(sphere.verts[:, 0] > 0, 1.0, 0.2)
     found = VertexMap.between(sphere, sphere, np.arange(sphere.V), confidence=confidence)
