@@ -45,6 +45,7 @@ _SECOND_CATEGORIES, _GROUP_SIZE = ("quadruped",), 2
 _MIN_PLAUSIBLE_TRUST = 0.25
 _MAX_CLASSIFIED = 40  # files of a folder that are classified
 _HINT_MODEL = "name the model (--model NAME, in Python model=NAME) if that is wrong"
+_HINT_DIRECT = "--model none matches two shapes directly"
 _HINT_WITHOUT = "exclude what does not belong to it with --without (`meshmatch info` lists parts), or try --try-harder"
 
 
@@ -217,7 +218,7 @@ def choose_model(
         if kind is not None and kind not in names and names:
             ((other, name),) = names.items()
             problem = f"two kinds of shapes: {name}: {other}; {shape.name}: {kind}"
-            raise InputError(problem, f"match shapes of one kind; {_HINT_MODEL}")
+            raise InputError(problem, f"match shapes of one kind; {_HINT_MODEL}; {_HINT_DIRECT}")
         if kind is not None:
             names.setdefault(kind, shape.name)
     common = next(iter(names), models[int(residuals.sum(1).argmin())].card.category)
@@ -227,7 +228,7 @@ def choose_model(
     notes = [
         f"{shape.name or 'the shape'}: {each.kind}{suffix}"
         if each.kind
-        else f"{shape.name} {_uncertain_note(shape, each, common + suffix)}"
+        else f"{shape.name} {_uncertain_note(shape, each, common + suffix, len(shapes) == 2)}"
         for shape, each in zip(shapes, found, strict=True)
     ]
     usable = [
@@ -237,12 +238,12 @@ def choose_model(
     return Choice(chosen, clean, notes, usable, parts_tried)
 
 
-def _uncertain_note(shape: Shape, found: Classification, assumed: str) -> str:
+def _uncertain_note(shape: Shape, found: Classification, assumed: str, is_pair: bool) -> str:
     why = "may be a part, or a rough cloud" if shape.is_cloud else "may be a part, or several objects"
     if not shape.is_cloud and found.fit is not None and _may_be_of_kind(found, {found.card.category}):
-        why = f"hardly looks like it (trust {found.fit.trust:.2f})"
-    hint = _HINT_MODEL if shape.is_cloud else f"{_HINT_MODEL}; {_HINT_WITHOUT}"
-    return f"{why}: treated as {assumed}; {hint}"
+        why = why if found.fit.partial else f"hardly looks like it (trust {found.fit.trust:.2f})"
+    hints = [_HINT_MODEL] + [_HINT_DIRECT] * is_pair + [_HINT_WITHOUT] * (not shape.is_cloud)
+    return f"{why}: treated as {assumed}; {'; '.join(hints)}"
 
 
 def classify_shapes(
@@ -297,7 +298,8 @@ def _refuse_unknown(
             names = ", ".join(sorted({model.card.category for model in models}))
             problem = f"{shape.name} does not look like anything that the installed models know: {names}"
             error = UnknownKindsError if all(other.kind is None for other in found) else InputError
-            raise error(problem, _nearest_kind_hint(each) if np.isfinite(nearest) else _HINT_WITHOUT)
+            hint = _nearest_kind_hint(each) if np.isfinite(nearest) else _HINT_WITHOUT
+            raise error(problem, f"{hint}; {_HINT_DIRECT}" if len(found) == 2 else hint)
 
 
 def _may_be_of_kind(found: Classification, kinds: Collection[str]) -> bool:

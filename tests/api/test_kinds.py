@@ -78,7 +78,7 @@ def test_the_model_that_reads_all_shapes_best_is_chosen() -> None:
 def test_two_kinds_are_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"man 3 4 6: human; dog 6 6 4: quadruped") as caught:
         choose(ball("man 3 4 6"), ball("dog 6 6 4"))
-    assert "--model" in caught.value.hint
+    assert "--model" in caught.value.hint and "--model none matches" in caught.value.hint
     # also where a model of one kind reads both low
     with pytest.raises(InputError, match="two kinds"):
         choose(ball("man 3 4 4.5"), ball("dog 6 6 4"))
@@ -100,6 +100,10 @@ def test_a_complete_shape_of_no_kind_is_refused() -> None:
     with pytest.raises(InputError) as caught:  # too strange for a fit
         choose(ball("man 3 4 6"), ball("robot 8 9 9"))
     assert caught.value.hint.startswith("nearest: human; if it is one, name the model: --model human")
+    assert caught.value.hint.endswith("; --model none matches two shapes directly")
+    with pytest.raises(InputError) as caught:  # one shape alone is matched to nothing
+        choose(ball("robot 8 9 9"))
+    assert "none" not in caught.value.hint
 
 
 @pytest.mark.usefixtures("models")
@@ -157,6 +161,15 @@ def test_a_fit_as_a_part_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(classify.Fitter, "fit", lambda *_: fit)
     for reading, known in ((0.048, True), (0.055, False)):
         assert classify.classify(as_model("human"), ball("half"), reading, CONFIG, None) == (known, fit)
+
+
+@pytest.mark.usefixtures("models")
+def test_a_part_of_an_uncertain_kind_is_called_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = SimpleNamespace(verdict="good", trust=1.0, partial=True)
+    monkeypatch.setattr(classify.Fitter, "fit", lambda *_: fit)
+    words = choose(ball("half 5.5 7 7", opened=True), ball("man 3 4 6"))[1]
+    assert words[0].startswith("half 5.5 7 7 may be a part, or several objects: treated as human; name the model")
+    assert "; --model none matches two shapes directly; " in words[0]
 
 
 @pytest.mark.usefixtures("models")
