@@ -130,7 +130,8 @@ def load_shapes(paths: Sequence[str | Path], *, only: Choice = (), without: Choi
     for pattern in (*chosen, *left_out):
         if all(each.select(pattern) is None for each in named_shapes):
             raise _unknown_name(pattern, named_shapes)
-    return [each.weighted(chosen, left_out) for each in named_shapes]
+    hint = "a selection applies to every file that has such a part: choose with --only instead" if len(paths) > 1 else ""
+    return [each.weighted(chosen, left_out, hint) for each in named_shapes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +165,8 @@ class _NamedShape:
             return np.asarray(parts.number == int(pattern))
         return None
 
-    def weighted(self, only: Sequence[str], without: Sequence[str]) -> Shape:
-        """The shape with weight 1 at selected vertices, and 0 at all others."""
+    def weighted(self, only: Sequence[str], without: Sequence[str], hint: str = "") -> Shape:
+        """The shape with weight 1 at selected vertices, and 0 at all others; ``hint`` is for an error if none is left."""
         selected, excluded = (
             [own for each in names if (own := self.select(each)) is not None] for names in (only, without)
         )
@@ -176,7 +177,7 @@ class _NamedShape:
             is_fitted = is_fitted & ~np.any(excluded, axis=0)
         if not (is_fitted if self.shape.is_cloud else is_fitted[self.shape.faces]).any():
             noun, nouns = ("mesh", "meshes") if self.meshes else ("part", "parts")
-            raise InputError(f"no {noun} of {self.shape.name} is left", f"choose fewer {nouns} to leave out")
+            raise InputError(f"no {noun} of {self.shape.name} is left", hint or f"choose fewer {nouns} to leave out")
         return replace(self.shape, weights=is_fitted.astype(float))
 
 

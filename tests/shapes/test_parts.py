@@ -187,8 +187,12 @@ def test_wrong_numbers_are_told(three: Shape, tmp_path: Path, make_sphere: Calla
         assert "number of parts: three.ply: 3" in caught.value.hint
     with pytest.raises(InputError, match=r"cloud\.xyz has no part 1"):
         load_shape(tmp_path / "cloud.xyz", only=1)
-    with pytest.raises(InputError, match=r"no part of three\.ply is left"):
+    with pytest.raises(InputError, match=r"no part of three\.ply is left") as caught:
         load_shape(tmp_path / "three.ply", without=[1, 2, 3])
+    assert caught.value.hint == "choose fewer parts to leave out"
+    with pytest.raises(InputError, match=r"no part of ball\.ply is left") as caught:  # only the other's was meant
+        load_shapes([tmp_path / "three.ply", tmp_path / "ball.ply"], without=1)
+    assert "every file that has such a part: choose with --only" in caught.value.hint
     # of two files, one that lacks the number is not asked for it
     first, second = load_shapes([tmp_path / "three.ply", tmp_path / "ball.ply"], only=2)
     assert first.weights is not None and second.weights is None
