@@ -397,7 +397,10 @@ def fit_same_pose(
         poor = _Judged.of(task, best).judgement.verdict == "poor"
         if part.energy < (1.0 if poor else _PART_RATIO_IF_ALIKE if best.alike else _PART_RATIO) * best.energy:
             task = _Task(template, shape, config, whole)
-            return _Judged.of(task, task.fitted(part.initial)).fit(0.0, began), False
+            judged = _Judged.of(task, task.fitted(part.initial))
+            fit = judged.fit(0.0, began)
+            crushed = judged.judgement.features.stretch > _FOLDING_STRETCH  # a part in the same pose need not stretch
+            return replace(fit, verdict="poor") if crushed else fit, False
     if not best.alike:
         return None
     task = _Task(template, shape, config)

@@ -9,7 +9,7 @@ import pytest
 from meshmatch.api.matcher import Matcher
 from meshmatch.arrays import Bools, Floats
 from meshmatch.experiments.makers.bones import BoneScan, draw_bones, scan
-from meshmatch.fitting import same_pose
+from meshmatch.fitting import same_pose, without_model
 from meshmatch.fitting.direct import MIRROR, DirectMatch, match_either_side
 from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
@@ -20,7 +20,7 @@ from meshmatch.fitting.one_way import DirectConfig, KnownPairs
 from meshmatch.fitting.same_pose import fit_as_part, is_refined, refine_fit, refine_match
 from meshmatch.fitting.solve.system import node_system
 from meshmatch.fitting.solve.viscous import ViscousConfig
-from meshmatch.fitting.without_model import fit_same_pose_near, fit_without_model
+from meshmatch.fitting.without_model import fit_same_pose, fit_same_pose_near, fit_without_model
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.geometry.trees import cKDTree
 from meshmatch.models.trained import TrainedModel
@@ -100,6 +100,17 @@ def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
     assert of_whole.template_hash == of_broken.template_hash and not of_whole.vectors.any()
     swapped = replace(seen, source=of_broken, target=of_whole)
     assert errors(swapped, LEFT, RIGHT, broken, kept).mean() < 4
+
+
+@pytest.mark.parametrize(("limit", "verdict"), [(0.0, "poor"), (1.0, "fair")])
+def test_a_part_that_had_to_be_crushed_is_poor(monkeypatch: pytest.MonkeyPatch, limit: float, verdict: Verdict) -> None:
+    """The head of a teddy that lies on the belly of another has a stretch of 1.4, right parts up to 0.8."""
+    monkeypatch.setattr(without_model, "_FOLDING_STRETCH", limit)
+    broken, size, config = cut(RIGHT, -0.1)[0], float(np.sqrt(RIGHT.shape.area)), same_pose.ViscousConfig()
+    template = template_of(RIGHT.shape, "whole", config)
+    guess = fit_without_model(template_of(broken, "own", config), broken, config, mirror=False)
+    found = fit_same_pose(template, broken, (guess.points, guess), config, mirror=False, whole=size, turned=False)
+    assert found is not None and found[0].partial and found[0].verdict == verdict
 
 
 def test_two_broken_ones_share_what_both_have() -> None:
