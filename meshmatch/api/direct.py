@@ -14,6 +14,7 @@ from meshmatch.fitting.fit import Fit
 from meshmatch.fitting.fit_config import FitConfig
 from meshmatch.maps.build import judge_by_pairs
 from meshmatch.progress import ProgressCallback
+from meshmatch.shapes.parts import Parts
 from meshmatch.shapes.repair import Repaired
 from meshmatch.threads import thread_limit, worker_slot
 
@@ -69,6 +70,8 @@ def match_without_model(
     for fit, one, other in zip(fits, clean, clean[::-1], strict=True):
         if fit.partial:
             notes = (*notes, f"{one.shape.name}: taken for a part of {other.shape.name}")
+    if mapped.verdict == "poor":
+        notes = (*notes, *_notes_on_parts(clean))
     if guess is not None:
         notes = (_NOTE_BETTER.format(guess.source_fit.model), *notes)
     seconds = time.monotonic() - began
@@ -119,6 +122,15 @@ def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknow
         notes.append(_NOTE_UNUSED)
     notes += [f"{each.shape.name}: {note}" for each in clean for note in each.notes]
     return tuple(dict.fromkeys(notes))
+
+
+def _notes_on_parts(clean: Sequence[Repaired]) -> list[str]:
+    """Notes on shapes with several parts, none of which the user left out: no model can tell which do not belong to it."""
+    counts = [
+        0 if each.original.weights is not None else len(Parts.of(each.original, bases=True)) for each in clean
+    ]
+    how = "if it is not all one object, choose with --only (`meshmatch info` lists parts)"
+    return [f"{each.shape.name}: has {n} parts: {how}" for each, n in zip(clean, counts, strict=True) if n > 1]
 
 
 def are_whole_meshes(clean: Sequence[Repaired], fits: Sequence[Fit]) -> bool:

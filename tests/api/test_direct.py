@@ -20,10 +20,12 @@ from meshmatch.errors import InputError, OptionError
 from meshmatch.fitting import direct, same_pose
 from meshmatch.geometry.frames import Frame, kabsch
 from meshmatch.maps.deformed import deformed
+from meshmatch.shapes.parts import leave_out
 from meshmatch.shapes.repair import repair
 from meshmatch.shapes.shape import Shape
 from tests.fitting.small_viscous import SmallViscous
 from tests.fitting.test_direct import QUICK, bent, creature
+from tests.shapes.scenes import together
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +109,24 @@ def test_a_pair_may_be_alike_unless_something_is_known_of_it(
     assert result.seconds < 1e6  # of all that was done, not of one fit
     same = np.arange(5), np.arange(5)
     assert not any("part" in note for note in match_without_model(clean, configs, same, 1, None).notes)
+
+
+def test_a_poor_match_of_several_parts_says_how_to_choose(
+    shapes: tuple[Shape, Shape], found: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No model is at hand that could tell which part is the floor."""
+    source, target = shapes
+    floor = Shape(np.array([[-2.0, 0, -2], [2, 0, -2], [2, 0, 2], [-2, 0, 2]]), np.array([[0, 2, 1], [0, 3, 2]]))
+    scene = together("scene", source, floor)
+    monkeypatch.setattr(same_pose, "refine_match", lambda *given: given[2])
+    configs, words = [meshmatch.FitConfig()] * 2, "scene: has 2 parts: if it is not all one object, choose with --only"
+    for verdict, one, said in (("poor", scene, True), ("good", scene, False), ("poor", leave_out(scene, [1]), False)):
+        of_target = replace(found.target, verdict=verdict)
+        monkeypatch.setattr(direct, "match_either_side", lambda *_, now=of_target: replace(found, target=now))
+        clean = [repair_allowing_parts(one), repair_allowing_parts(target)]
+        notes = match_without_model(clean, configs, None, 1, None).notes
+        assert any(note.startswith(words) for note in notes) == said
+        assert not any(note.startswith("target: has") for note in notes)
 
 
 @pytest.mark.usefixtures("quick")
