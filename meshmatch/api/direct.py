@@ -126,9 +126,7 @@ def direct_notes(clean: Sequence[Repaired], configs: Sequence[FitConfig], unknow
 
 def _notes_on_parts(clean: Sequence[Repaired]) -> list[str]:
     """Notes on shapes with several parts, none of which the user left out: no model can tell which do not belong to it."""
-    counts = [
-        0 if each.original.weights is not None else len(Parts.of(each.original, bases=True)) for each in clean
-    ]
+    counts = [0 if each.original.weights is not None else len(Parts.of(each.original, bases=True)) for each in clean]
     how = "if it is not all one object, choose with --only (`meshmatch info` lists parts)"
     return [f"{each.shape.name}: has {n} parts: {how}" for each, n in zip(clean, counts, strict=True) if n > 1]
 

@@ -130,7 +130,9 @@ def load_shapes(paths: Sequence[str | Path], *, only: Choice = (), without: Choi
     for pattern in (*chosen, *left_out):
         if all(each.select(pattern) is None for each in named_shapes):
             raise _unknown_name(pattern, named_shapes)
-    hint = "a selection applies to every file that has such a part: choose with --only instead" if len(paths) > 1 else ""
+    hint = (
+        "a selection applies to every file that has such a part: choose with --only instead" if len(paths) > 1 else ""
+    )
     return [each.weighted(chosen, left_out, hint) for each in named_shapes]
 
 
