@@ -46,6 +46,7 @@ from meshmatch.threads import parallel_map
 # Shapes are alike if a rigid motion brings them this near (units of sqrt(area)): femurs, knees and molars come to 0.04 to
 # 0.06, hearts and leaves up to 0.066; people, ants and fish to 0.069 and more.
 _MAX_ALIKE_DISTANCE = 0.067
+_MAX_SIZE_RATIO = 3.0  # of two sqrt(area), above which the files probably have different units
 _CLEAR_SIDE = 0.05  # least `Fit.side` of a clear side: 0.15 and more for molars
 
 
@@ -88,6 +89,8 @@ def refine_match(
     smaller, larger = sorted((source, target), key=lambda shape: shape.area)
     part = may_be_part(smaller, config) and rim_lengths(smaller).max() > MIN_RIM_LENGTH
     whole, other = (larger, smaller) if part else (source, target)
+    if part and found.verdict == "good":
+        found = _doubted_if_sizes_differ(found, smaller, larger, smaller is source)
     if not part and min(found.apart or alignment_residuals(source, target, config.seed)) > _MAX_ALIKE_DISTANCE:
         return found
     report = Progress(progress, other.name).stage("fits of shapes that stand alike")
@@ -116,6 +119,17 @@ def refine_match(
     report(1.0)
     first, second = fits if whole is source else fits[::-1]
     return replace(found, source=first, target=second, system=system)
+
+
+def _doubted_if_sizes_differ(found: DirectMatch, part: Shape, whole: Shape, part_is_source: bool) -> DirectMatch:
+    """A good match, made fair if an open shape may be a part of a closed one, but cannot be fitted as one at its size."""
+    ratio = float(np.sqrt(whole.area / part.area))
+    if ratio <= _MAX_SIZE_RATIO or rim_lengths(whole).max() > MIN_RIM_LENGTH:
+        return found
+    doubt = [Reason("doubt", f"it may be a part, but the sizes in the files differ {ratio:.0f}-fold: use one unit")]
+    if part_is_source:
+        return replace(found, source=cap_verdict(found.source, doubt))
+    return replace(found, target=cap_verdict(found.target, doubt))
 
 
 def refine_fit(

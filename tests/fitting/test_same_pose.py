@@ -102,6 +102,20 @@ def test_a_broken_one_is_a_part_of_a_whole_one(source_is_broken: bool) -> None:
     assert errors(swapped, LEFT, RIGHT, broken, kept).mean() < 4
 
 
+def test_a_part_in_another_unit_is_not_taken_for_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a femur in metres was stretched over a whole one in millimetres, and called good."""
+    monkeypatch.setattr(same_pose, "fit_same_pose", lambda *_: None)
+    broken, whole = cut(RIGHT, -0.1)[0], LEFT.shape
+    found = match_either_side(whole, whole, replace(FAST, n_second=2, n_third=1))
+    good = replace(found, source=replace(found.source, verdict="good"), target=replace(found.target, verdict="good"))
+    small = Shape(broken.verts / 1000, broken.faces, "small")
+    for pair in ((small, whole), (whole, small)):
+        doubted = refine_match(*pair, good, FitConfig())
+        assert doubted.verdict == "fair" and "use one unit" in str(doubted.reasons[0])
+    for pair in ((broken, whole), (small, broken)):  # of one unit; and of two shapes that are both cut
+        assert refine_match(*pair, good, FitConfig()).verdict == "good"
+
+
 @pytest.mark.parametrize(("limit", "verdict"), [(0.0, "poor"), (1.0, "fair")])
 def test_a_part_that_had_to_be_crushed_is_poor(monkeypatch: pytest.MonkeyPatch, limit: float, verdict: Verdict) -> None:
     """The head of a teddy that lies on the belly of another has a stretch of 1.4, right parts up to 0.8."""
