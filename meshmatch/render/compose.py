@@ -88,10 +88,9 @@ def compose_match(
 
     What fits ignore (weight 0), such as a floor, is not drawn. `InputError` for a map that is not of these shapes.
     """
-    back = invert_map(vertex_map, source, target)
     drawn = _without_ignored(source), _without_ignored(target)
     turns = rotations_to_same_side(*drawn, vertex_map, rotations, look.up, look.front)
-    here = position_colors(drawn[0], turns[0])
+    here, back = position_colors(drawn[0], turns[0]), invert_map(vertex_map, source, target)
     panels = _colored_panels(drawn, (here, matched_colors(here, vertex_map, back, source)))
     caption = "corresponding points in the same color"
     caption += "" if drawn == (source, target) else ", without what was left out"
