@@ -107,7 +107,7 @@ def _kills_as_interrupts() -> Iterator["_Killed"]:
 def _refuse_empty(words: Sequence[str]) -> None:
     """Raise `OptionError` for an empty argument: as a path it would mean the current folder."""
     for before, word in zip(["meshmatch", *words], words, strict=False):
-        is_empty = word == "" or (word.startswith("--") and word.endswith("="))
+        is_empty = word == "" or (word.startswith("--") and word.find("=") == len(word) - 1)
         if is_empty and (word[:-1] or before) not in _MAY_BE_EMPTY:
             what = f"{word[:-1]} is empty" if word else f"the argument after {before} is empty"
             raise OptionError(what, "is it a variable that is not set?")

@@ -71,6 +71,7 @@ def test_an_empty_argument_is_not_the_current_folder(
     for call in (meshmatch.load_shape, meshmatch.Collection):
         with pytest.raises(InputError, match="a path is empty"):
             call("")
+    assert "no file nothing.ply" in run("match", "nothing.ply", "b.ply", "-o", "x.npz", "--only=x=").err  # a name
 
 
 def test_a_word_that_is_none_of_the_choices(run: Run) -> None:
