@@ -37,7 +37,7 @@ from meshmatch.fitting.solve.viscous import ViscousConfig, viscous_vectors
 from meshmatch.geometry.frames import Frame, RigidPose
 from meshmatch.geometry.oriented import OrientedPoints
 from meshmatch.models.registry import NO_MODEL
-from meshmatch.shapes.alignment import Align, align, sqrt_area_frame
+from meshmatch.shapes.alignment import Align, align, align_part, sqrt_area_frame
 from meshmatch.shapes.rims import RimPoints, is_sheet
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
@@ -146,18 +146,18 @@ class _Task:
         return _Fitted(initial, samples, vectors, features)
 
     def aligned_starts(
-        self, side: Frame | None, how: Align = "rigid", keep: int = 1, most: float = np.inf
+        self, side: Frame | None, how: Align = "rigid", keep: int = 1, most: float = np.inf, placed: bool = False
     ) -> list[_Start]:
         """Starts with the undeformed template, rigidly aligned to the shape, or to its mirror image if ``side`` is given.
 
-        ``how`` is the kind of alignment. At most ``keep`` starts are returned, the best first, with residuals up to
-        ``most`` times that of the best.
+        ``how`` is the kind of alignment; if ``placed``, that of a part to any place of the template is used. At most
+        ``keep`` starts are returned, the best first, with residuals up to ``most`` times that of the best.
         """
         outer = self._own if side is None else self._own.compose(side)
         normals = self._samples.normals if side is None else self._samples.normals @ side.rotation.T
         points = self._samples.points if side is None else side.apply(self._samples.points)
         samples = replace(self._samples, points=points, normals=normals).first(_ALIGN_SAMPLES)
-        found = align(samples, self._resting, how, keep)
+        found = align_part(samples, self._resting, keep) if placed else align(samples, self._resting, how, keep)
         frames = [outer.compose(each.pose.frame) for each in found if each.residual <= most * found[0].residual]
         return [_Start(frame, np.zeros((self.system.K, 3))) for frame in frames]
 
@@ -220,9 +220,16 @@ class _Task:
         return closest
 
     def best_part(self, sides: Sequence[Frame | None]) -> _Fitted:
-        """The best fit of a part, over both sides."""
-        starts = [initial for side in sides for initial in self.aligned_starts(side, keep=_PART_TURNS)]
-        return min(parallel_map(self.fitted, starts), key=attrgetter("energy"))
+        """The best fit of a part, over both sides.
+
+        It starts with both centroids together or, if that is clearly better, with the part anywhere on the template.
+        """
+
+        def best(placed: bool) -> _Fitted:
+            starts = [start for side in sides for start in self.aligned_starts(side, keep=_PART_TURNS, placed=placed)]
+            return min(parallel_map(self.fitted, starts), key=attrgetter("energy"))
+
+        return _clearly_better(best(placed=True), best(placed=False), _TURNED_RATIO)
 
     def best_from(self, start: Fit) -> _Fitted:
         """The best fit starting from a fit of another template with the same vertices."""

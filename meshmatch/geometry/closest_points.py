@@ -21,7 +21,7 @@ class ClosestPoints:
     """Two centred point sets. Poses are those of the target: ``pose.to_world(target)`` approximates the shape.
 
     ``queries`` are the rows of the shape and of the target that search for their closest point among all points of the
-    other set; by default all rows.
+    other set; by default all rows. If the shape is a part of the target (``partial``), only its points search.
     """
 
     def __init__(
@@ -29,12 +29,14 @@ class ClosestPoints:
         shape: OrientedPoints,
         target: OrientedPoints,
         queries: tuple[Int[Ints, " P"], Int[Ints, " Q"]] | None = None,
+        partial: bool = False,
     ) -> None:
         self._shape, self._target = shape, target
         self._features = shape.features, target.features
         self._shape_queries, self._target_queries = (
             (shape, target) if queries is None else (shape.rows(queries[0]), target.rows(queries[1]))
         )
+        self._shares = (1.0, 0.0) if partial else (0.5, 0.5)  # weights of the two directions
 
     def _transformed_queries(
         self, turns: Float[Floats, "N 3 3"], centers: Float[Floats, "N 3"]
@@ -65,7 +67,8 @@ class ClosestPoints:
         forward = np.linalg.norm(shape_local - self._features[1][to_target], axis=2)
         backward = np.linalg.norm(target_world - self._features[0][to_shape], axis=2)
         return np.asarray(
-            0.5 * np.minimum(forward, _MAX_DISTANCE).mean(1) + 0.5 * np.minimum(backward, _MAX_DISTANCE).mean(1)
+            self._shares[0] * np.minimum(forward, _MAX_DISTANCE).mean(1)
+            + self._shares[1] * np.minimum(backward, _MAX_DISTANCE).mean(1)
         )
 
     def nearer(self, poses: list[RigidPose], steps: int) -> list[RigidPose]:
@@ -73,7 +76,7 @@ class ClosestPoints:
         turns, centers = _stack_poses(poses)
         shape_queries, target_queries, active = self._shape_queries, self._target_queries, np.arange(len(poses))
         weight = np.repeat(
-            [1 / len(shape_queries.points), 1 / len(target_queries.points)],
+            [self._shares[0] / len(shape_queries.points), self._shares[1] / len(target_queries.points)],
             [len(shape_queries.points), len(target_queries.points)],
         )
         for _ in range(steps):

@@ -13,6 +13,7 @@ from operator import attrgetter
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Floats
@@ -31,7 +32,9 @@ Mirroring = Literal["auto", "no"]
 # Set by hand.
 # maximum residual of a rotation that replaces the given orientation, relative to the latter's
 _MAX_RESIDUAL_RATIO = 0.9
-_MIN_ANGLE = 15.0  # alignments closer than this, in degrees, are treated as one
+_N_PLACES = 8  # places of a part's center on its whole from which an alignment starts
+# alignments closer than this, in degrees (for a part, and in sqrt(area)), are treated as one
+_MIN_ANGLE, _MIN_SHIFT = 15.0, 0.1
 # Height of standing people in metres; a unit is plausible if it brings the longest extent into this range.
 _MIN_HEIGHT, _MAX_HEIGHT = 1.2, 2.2
 _MIN_SLENDERNESS = 1.0  # minimum longest extent of a person in sqrt(area): 1.1 to 1.7 in any pose
@@ -138,6 +141,21 @@ def align(shape: OrientedPoints, target: OrientedPoints, how: Align, keep: int =
     return _distinct(candidates)[:keep]
 
 
+def align_part(shape: OrientedPoints, target: OrientedPoints, keep: int = 1) -> list[Alignment]:
+    """Rigid motions that align a target with a shape that is a part of it, the best first: at most ``keep``.
+
+    Both have one scale, and their points are in random order. The part is rotated by the 24 rotations of a cube, and its
+    center is put onto places all over the target; residuals are those of the part's points alone.
+    """
+    coarse = ClosestPoints(shape.thinned(200), target.thinned(300), partial=True)
+    fine = ClosestPoints(shape.thinned(1200), target.thinned(1200), partial=True)
+    center, places = shape.points.mean(0), kmeans2(target.points, _N_PLACES, seed=0, minit="++")[0]
+    rotations = Rotation.create_group("O").as_matrix()
+    starts = [RigidPose(turn, center - turn @ place) for turn in rotations for place in places]
+    chosen = _best_first(_refine(coarse, starts, 6))[: 4 * keep]
+    return _distinct(_best_first(_refine(fine, [each.pose for each in chosen], 25)), _MIN_SHIFT)[:keep]
+
+
 def _refine(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[Alignment]:
     nearer = points.nearer(poses, steps)
     return [Alignment(*each) for each in zip(nearer, points.residuals(nearer).tolist(), strict=True)]
@@ -147,11 +165,15 @@ def _best_first(alignments: list[Alignment]) -> list[Alignment]:
     return sorted(alignments, key=attrgetter("residual"))
 
 
-def _distinct(alignments: list[Alignment]) -> list[Alignment]:
-    """The alignments that are not close to an earlier one."""
+def _distinct(alignments: list[Alignment], min_shift: float = np.inf) -> list[Alignment]:
+    """The alignments that are not close to an earlier one, in rotation and up to ``min_shift`` in translation."""
     distinct: list[Alignment] = []
     for each in alignments:
-        if all(each.pose.angle_to(other.pose) > _MIN_ANGLE for other in distinct):
+        if all(
+            each.pose.angle_to(other.pose) > _MIN_ANGLE
+            or np.linalg.norm(each.pose.center - other.pose.center) > min_shift
+            for other in distinct
+        ):
             distinct.append(each)
     return distinct
 

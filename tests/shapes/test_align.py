@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from meshmatch.geometry.oriented import OrientedPoints
-from meshmatch.shapes.alignment import ALIGNS, align, alignment_residual
+from meshmatch.shapes.alignment import ALIGNS, align, align_part, alignment_residual
 from meshmatch.shapes.sampling import sample_surface
 from meshmatch.shapes.shape import Shape
 
@@ -69,3 +69,19 @@ def test_the_residual_by_hand() -> None:
 
 def test_the_ways_have_names() -> None:
     assert ALIGNS == ("none", "near", "rigid")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_end_finds_its_place(pear: OrientedPoints, sign: int) -> None:
+    """Aligned by their centers, it lies in the middle of the whole."""
+    along = sign * pear.points[:, 1]
+    rows = np.flatnonzero(along > np.quantile(along, 0.7))
+    rotation = Rotation.from_euler("xyz", [100, 20, 30], degrees=True).as_matrix()
+    end = turned(pear.rows(rows), rotation, -rotation @ pear.points[rows].mean(0))
+    best, *others = align_part(end, pear, keep=2)
+    errors = [
+        np.linalg.norm(each.pose.to_local(end.points) - pear.points[rows], axis=1).mean()
+        for each in (best, align(end, pear, "rigid")[0])
+    ]
+    assert errors[0] < 0.01 < 0.05 < errors[1]
+    assert best.residual < 0.01 and len(others) == 1 and others[0].residual > 2 * best.residual
