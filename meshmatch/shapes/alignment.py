@@ -33,8 +33,7 @@ Mirroring = Literal["auto", "no"]
 # maximum residual of a rotation that replaces the given orientation, relative to the latter's
 _MAX_RESIDUAL_RATIO = 0.9
 _N_PLACES = 8  # places of a part's center on its whole from which an alignment starts
-# alignments closer than this, in degrees (for a part, and in sqrt(area)), are treated as one
-_MIN_ANGLE, _MIN_SHIFT = 15.0, 0.1
+_MIN_ANGLE = 15.0  # alignments closer than this, in degrees, are treated as one
 # Height of standing people in metres; a unit is plausible if it brings the longest extent into this range.
 _MIN_HEIGHT, _MAX_HEIGHT = 1.2, 2.2
 _MIN_SLENDERNESS = 1.0  # minimum longest extent of a person in sqrt(area): 1.1 to 1.7 in any pose
@@ -153,7 +152,7 @@ def align_part(shape: OrientedPoints, target: OrientedPoints, keep: int = 1) -> 
     rotations = Rotation.create_group("O").as_matrix()
     starts = [RigidPose(turn, center - turn @ place) for turn in rotations for place in places]
     chosen = _best_first(_refine(coarse, starts, 6))[: 4 * keep]
-    return _distinct(_best_first(_refine(fine, [each.pose for each in chosen], 25)), _MIN_SHIFT)[:keep]
+    return _best_first(_refine(fine, [each.pose for each in chosen], 25))[:keep]
 
 
 def _refine(points: ClosestPoints, poses: list[RigidPose], steps: int) -> list[Alignment]:
@@ -165,15 +164,11 @@ def _best_first(alignments: list[Alignment]) -> list[Alignment]:
     return sorted(alignments, key=attrgetter("residual"))
 
 
-def _distinct(alignments: list[Alignment], min_shift: float = np.inf) -> list[Alignment]:
-    """The alignments that are not close to an earlier one, in rotation and up to ``min_shift`` in translation."""
+def _distinct(alignments: list[Alignment]) -> list[Alignment]:
+    """The alignments that are not close to an earlier one."""
     distinct: list[Alignment] = []
     for each in alignments:
-        if all(
-            each.pose.angle_to(other.pose) > _MIN_ANGLE
-            or np.linalg.norm(each.pose.center - other.pose.center) > min_shift
-            for other in distinct
-        ):
+        if all(each.pose.angle_to(other.pose) > _MIN_ANGLE for other in distinct):
             distinct.append(each)
     return distinct
 
