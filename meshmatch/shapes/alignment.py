@@ -13,7 +13,6 @@ from operator import attrgetter
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
 from meshmatch.arrays import Floats
@@ -146,6 +145,8 @@ def align_part(shape: OrientedPoints, target: OrientedPoints, keep: int = 1) -> 
     Both have one scale, and their points are in random order. The part is rotated by the 24 rotations of a cube, and its
     center is put onto places all over the target; residuals are those of the part's points alone.
     """
+    from scipy.cluster.vq import kmeans2  # slow to import, and only parts need it
+
     coarse = ClosestPoints(shape.thinned(200), target.thinned(300), partial=True)
     fine = ClosestPoints(shape.thinned(1200), target.thinned(1200), partial=True)
     center, places = shape.points.mean(0), kmeans2(target.points, _N_PLACES, seed=0, minit="++")[0]

@@ -78,7 +78,7 @@ def test_an_end_finds_its_place(pear: OrientedPoints, sign: int) -> None:
     rows = np.flatnonzero(along > np.quantile(along, 0.7))
     rotation = Rotation.from_euler("xyz", [100, 20, 30], degrees=True).as_matrix()
     end = turned(pear.rows(rows), rotation, -rotation @ pear.points[rows].mean(0))
-    best = align_part(end, pear)[0]
+    best = align_part(end, pear, keep=2)[0]
     errors = [
         np.linalg.norm(each.pose.to_local(end.points) - pear.points[rows], axis=1).mean()
         for each in (best, align(end, pear, "rigid")[0])
