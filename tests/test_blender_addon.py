@@ -172,7 +172,7 @@ def test_the_extension_calls_verbs_that_there_are(extension: Path) -> None:
 def test_another_suffix_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["blender-addon", "-o", str(tmp_path / "a.py")]) == 1
     assert "end the name in .zip" in capsys.readouterr().err and not list(tmp_path.iterdir())
-    assert main(["blender-addon", "-o", ""]) == 1
+    assert main(["blender-addon", "-o", "."]) == 1
     assert capsys.readouterr().err.startswith("error: .: an extension")
 
 
